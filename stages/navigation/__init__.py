@@ -1,0 +1,5 @@
+"""Navigation: inertial data and GNSS fixes in, smoothed trajectory with sigmas out (the POS)."""
+
+from stages.navigation.pos import NavigationResult, NavigationSettings, run
+
+__all__ = ["NavigationResult", "NavigationSettings", "run"]

@@ -1,0 +1,157 @@
+"""Initial position, velocity and attitude, with sigmas.
+
+`given`         the campaign's own `initial` attitude
+`in_motion`     levelling by GNSS acceleration, heading by GNSS course
+`from_rest`     levelling at standstill, heading by the course once the vehicle moves, carried back by the gyros
+
+References
+----------
+.. [1] P. D. Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed., ch. 5.5–5.6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.records import Gnss, Imu
+from tsmftis.geodesy import normal_gravity, radii_of_curvature
+from tsmftis.rotation import exp_so3, rpy_to_dcm
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Start:
+    """The state at `time` [s]: lat, lon [rad], height [m]; velocity NED [m/s]; rpy [rad]; and sigmas (3,) each (position in m)."""
+
+    time: float
+    position: Array
+    velocity: Array
+    rpy: Array
+    sigma_position: Array
+    sigma_velocity: Array
+    sigma_rpy: Array
+    method: str
+
+
+def gnss_velocity(gnss: Gnss) -> Array:
+    """The receiver's velocity (n, 3), or differences of its positions where it gives none."""
+    if gnss.velocity is not None:
+        return gnss.velocity
+    north, east = radii_of_curvature(gnss.latitude)
+    rate = np.stack([np.gradient(v, gnss.time) for v in (gnss.latitude, gnss.longitude, gnss.height)], 1)
+    return rate * np.stack([north + gnss.height, (east + gnss.height) * np.cos(gnss.latitude), -np.ones(gnss.time.size)], 1)
+
+
+def kinematics(time: float, gnss: Gnss, dcm: Array, lever: Array) -> tuple[Array, Array, Array, Array]:
+    """Position and velocity of the IMU at `time` from the nearest fix, with sigmas that grow with the time to it.
+
+    An aircraft accelerates by up to some 5 m/s²: σ_v² = σ_fix² + (5·Δt)², σ_r² = σ_fix² + (2.5·Δt²)², at least 0.1 m and
+    0.1 m/s because the lever arm stands on the initial attitude.
+    """
+    velocity = gnss_velocity(gnss)
+    i = int(np.argmin(np.abs(gnss.time - time)))
+    dt = time - gnss.time[i]
+    v = velocity[i]
+    north, east = radii_of_curvature(gnss.latitude[i])
+    offset = v * dt - dcm @ lever
+    position = np.array([
+        gnss.latitude[i] + offset[0] / (north + gnss.height[i]),
+        gnss.longitude[i] + offset[1] / ((east + gnss.height[i]) * np.cos(gnss.latitude[i])),
+        gnss.height[i] - offset[2],
+    ])
+    sigma_v = gnss.sigma_velocity[i] if gnss.sigma_velocity is not None else np.full(3, 1.0)
+    return (
+        position, v,
+        np.sqrt(gnss.sigma_position[i] ** 2 + (2.5 * dt * dt) ** 2 + 0.1**2),
+        np.sqrt(sigma_v**2 + (5.0 * dt) ** 2 + 0.1**2),
+    )
+
+
+def given(time: float, rpy: Array, sigma_rpy: Array, gnss: Gnss, lever: Array) -> Start:
+    """Attitude as the campaign states it, position and velocity from the nearest fix."""
+    position, velocity, sigma_r, sigma_v = kinematics(time, gnss, rpy_to_dcm(*rpy), lever)
+    return Start(time, position, velocity, rpy, sigma_r, sigma_v, sigma_rpy, "given")
+
+
+def level(force_body: Array, force_ned: Array, yaw: float) -> tuple[float, float]:
+    """Roll and pitch that turn a body specific force into a known NED one for a given yaw.
+
+    With f_h = Rz(−yaw)·f_ned: cos r·f_y − sin r·f_z = f_h,y gives roll, then Ry(pitch)·Rx(roll)·f = f_h gives pitch.
+    """
+    c, s = np.cos(yaw), np.sin(yaw)
+    target = np.array([c * force_ned[0] + s * force_ned[1], -s * force_ned[0] + c * force_ned[1], force_ned[2]])
+    size = np.hypot(force_body[1], force_body[2])
+    # |f| differs by the accelerometer's errors: the sine is clipped rather than refused.
+    roll = np.arctan2(-force_body[1], -force_body[2]) + np.arcsin(np.clip(target[1] / size, -1.0, 1.0))
+    z = np.sin(roll) * force_body[1] + np.cos(roll) * force_body[2]
+    pitch = np.arctan2(target[0], target[2]) - np.arctan2(force_body[0], z)
+    return float(roll), float((pitch + np.pi) % (2 * np.pi) - np.pi)
+
+
+def align(imu: Imu, gnss: Gnss, lever: Array, course_speed: float) -> Start:
+    """Self-alignment: in motion where the first fixes move faster than `course_speed` [m/s], else from rest.
+
+    The heading is the GNSS course (no crab angle: sigma 10° in motion, 20° from rest); the flight's own accelerations
+    refine it, and the filter is run again from the smoothed start. Raises InputError where the unit never moves fast
+    enough for a course.
+    """
+    velocity = gnss_velocity(gnss)
+    start = max(float(imu.time[0]), float(gnss.time[0]) - 1.0)
+    inside = (gnss.time >= start) & (gnss.time <= imu.time[-1])
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    moving = np.flatnonzero(inside & (speed > course_speed))
+    if moving.size == 0:
+        raise InputError(
+            "gnss", "velocity", f"never exceeds {course_speed:g} m/s, so no heading can be taken from the course",
+            "give flights[].initial in campaign.yaml or lower navigation.course_speed_m_per_s",
+        )
+    first = int(moving[0])
+    if gnss.time[first] - start < 2.0:
+        return _in_motion(imu, gnss, velocity, first, lever)
+    return _from_rest(imu, gnss, velocity, moving, start, lever)
+
+
+def _mean_force(imu: Imu, start: float, stop: float) -> Array:
+    inside = (imu.time > start) & (imu.time <= stop)
+    return imu.accel[inside].mean(axis=0)
+
+
+def _in_motion(imu: Imu, gnss: Gnss, velocity: Array, first: int, lever: Array) -> Start:
+    time = float(max(gnss.time[first], imu.time[0]))
+    yaw = float(np.arctan2(velocity[first, 1], velocity[first, 0]))
+    last = min(int(np.searchsorted(gnss.time, time + 1.0)), gnss.time.size - 1)
+    acceleration = (velocity[last] - velocity[first]) / max(gnss.time[last] - gnss.time[first], 1e-3)
+    gravity = float(normal_gravity(gnss.latitude[first], gnss.height[first]))
+    force = acceleration - np.array([0.0, 0.0, gravity])
+    roll, pitch = level(_mean_force(imu, time, time + 1.0), force, yaw)
+    rpy = np.array([roll, pitch, yaw])
+    position, v, sigma_r, sigma_v = kinematics(time, gnss, rpy_to_dcm(*rpy), lever)
+    return Start(time, position, v, rpy, sigma_r, sigma_v, np.deg2rad([3.0, 3.0, 10.0]), "in motion: GNSS course and acceleration")
+
+
+def _from_rest(imu: Imu, gnss: Gnss, velocity: Array, moving: NDArray[np.int64], start: float, lever: Array) -> Start:
+    rest = min(5.0, gnss.time[moving[0]] - start - 1.0)
+    force = _mean_force(imu, start, start + rest)
+    roll, pitch = level(force, np.array([0.0, 0.0, -np.linalg.norm(force)]), 0.0)
+    inside = (imu.time > start) & (imu.time <= start + rest)
+    rate_bias = imu.gyro[inside].mean(axis=0)
+    # Turn of the body from the start to each of the first moving fixes, by the gyros alone.
+    first = moving[:10]
+    levelled = rpy_to_dcm(roll, pitch, 0.0)
+    headings = []
+    for fix in first:
+        span = (imu.time > start) & (imu.time <= gnss.time[fix])
+        dcm = levelled
+        for step in exp_so3((imu.gyro[span] - rate_bias) * np.diff(imu.time, prepend=imu.time[0])[span, None]):
+            dcm = dcm @ step
+        forward = np.arctan2(dcm[1, 0], dcm[0, 0])
+        headings.append(np.exp(1j * (np.arctan2(velocity[fix, 1], velocity[fix, 0]) - forward)))
+    yaw = float(np.angle(np.mean(headings)))
+    rpy = np.array([roll, pitch, yaw])
+    position, v, sigma_r, sigma_v = kinematics(start, gnss, rpy_to_dcm(*rpy), lever)
+    return Start(start, position, v, rpy, sigma_r, sigma_v, np.deg2rad([2.0, 2.0, 20.0]), "from rest: levelling, then GNSS course")
