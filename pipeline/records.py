@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.datasets import checked, open_dataset, take, take_time
 from pipeline.errors import InputError
+from tsmftis.interferometer import Interferometer
 
 Array = NDArray[np.float64]
 
@@ -593,4 +594,80 @@ class ThermalCorrection:
                 take_time(d, path), take(d, path, "gyro", dims, "rad s-1"), take(d, path, "accel", dims, "m s-2"),
                 take(d, path, "sigma_gyro", dims, "rad s-1"), take(d, path, "sigma_accel", dims, "m s-2"),
                 take(d, path, "distance", ("time", "channel"), "1"),
+            )
+
+
+@dataclass(frozen=True)
+class CameraPoses:
+    """The camera at each frame: projection centre (frame, 3) [m] and C_camera→ECEF (frame, 3, 3); NaN outside the trajectory."""
+
+    time: Array
+    centre: Array
+    dcm: Array
+
+    def to_dataset(self) -> xr.Dataset:
+        return xr.Dataset(
+            {
+                "centre": (("frame", "ecef"), self.centre, {"units": "m"}),
+                "dcm": (("frame", "ecef", "camera"), self.dcm, {"units": "1", "long_name": "camera axes in ECEF, by column"}),
+            },
+            {"time": (("frame",), self.time, {"units": "s", "long_name": "mid-exposure time, latency taken off"})},
+        )
+
+    @classmethod
+    def from_file(cls, path: Path) -> CameraPoses:
+        with open_dataset(path) as d:
+            return cls(
+                take(d, path, "time", ("frame",), "s"), take(d, path, "centre", ("frame", "ecef"), "m", finite=False),
+                take(d, path, "dcm", ("frame", "ecef", "camera"), "1", finite=False),
+            )
+
+
+@dataclass(frozen=True)
+class Interferograms:
+    """Interferograms along the tracks, (method, target, point, col) each.
+
+    value [DN after dark and flat]; gain: var(sample)/var(pixel); row: mean detector row of the sample [px]; crossings: how
+    often the point crossed the column (0: interpolated from its neighbours).
+    """
+
+    methods: tuple[str, ...]
+    targets: tuple[str, ...]
+    value: Array
+    gain: Array
+    row: Array
+    crossings: Array
+
+    @property
+    def seen(self) -> Array:
+        """Fraction of the columns that each point crossed (method, target, point)."""
+        return (self.crossings > 0).mean(axis=-1)
+
+    def opd(self, interferometer: Interferometer) -> Array:
+        """OPD [m] of each sample: (col,) where rows do not matter, else (method, target, point, col)."""
+        columns = np.arange(self.value.shape[-1])
+        if interferometer.fringe_tilt == 0.0:
+            return interferometer.opd((interferometer.rows - 1) / 2, columns)
+        return interferometer.opd(self.row, columns)
+
+    def to_dataset(self) -> xr.Dataset:
+        dims = ("method", "target", "point", "col")
+        return xr.Dataset(
+            {
+                "value": (dims, self.value, {"units": "DN", "long_name": "after dark and flat"}),
+                "gain": (dims, self.gain, {"units": "1", "long_name": "variance of a sample over that of a pixel"}),
+                "row": (dims, self.row, {"units": "1", "long_name": "mean detector row of the sample"}),
+                "crossings": (dims, self.crossings, {"units": "1"}),
+            },
+            {"method": list(self.methods), "target": list(self.targets)},
+        )
+
+    @classmethod
+    def from_file(cls, path: Path) -> Interferograms:
+        dims = ("method", "target", "point", "col")
+        with open_dataset(path) as d:
+            return cls(
+                tuple(map(str, d["method"].values)), tuple(map(str, d["target"].values)),
+                take(d, path, "value", dims, "DN", finite=False),
+                *(take(d, path, n, dims, "1", finite=False) for n in ("gain", "row", "crossings")),
             )

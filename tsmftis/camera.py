@@ -59,6 +59,11 @@ class Camera:
         ray = np.stack([u * scale, v * scale, np.ones_like(u)], -1)
         return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
 
+    def central_frame(self, row: Array, col: Array) -> NDArray[np.int64]:
+        """For tracks (target, frame), the frame (target,) in which each is nearest to mid-detector."""
+        away = np.hypot(row - (self.rows - 1) / 2, col - (self.cols - 1) / 2)
+        return np.argmin(np.where(np.isfinite(away), away, np.inf), axis=1)
+
     def ground_sample(self, distance: float) -> float:
         """Nominal ground sample p·distance/f [m]."""
         return self.pixel_pitch * distance / self.focal_length

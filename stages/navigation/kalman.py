@@ -39,7 +39,7 @@ GYRO_BIAS, ACCEL_BIAS = slice(9, 12), slice(12, 15)
 GYRO_SCALE, ACCEL_SCALE = slice(15, 18), slice(18, 21)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _cross_into(matrix: Any, row: int, col: int, x: float, y: float, z: float, sign: float) -> None:
     """matrix[row:row+3, col:col+3] += sign·[v×]."""
     matrix[row, col + 1] -= sign * z
@@ -50,7 +50,7 @@ def _cross_into(matrix: Any, row: int, col: int, x: float, y: float, z: float, s
     matrix[row + 2, col + 1] += sign * x
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def dynamics(position: Any, velocity: Any, force: Any, mean_dcm: Any, mean_dcm_rate: Any, mean_dcm_force: Any, inverse_tau: Any, out: Any) -> None:
     """The error dynamics F (21, 21) at the epoch's mean: C f [m/s²] in NED, C, C·diag(ω), C·diag(f)."""
     out[:] = 0.0
@@ -100,7 +100,7 @@ def dynamics(position: Any, velocity: Any, force: Any, mean_dcm: Any, mean_dcm_r
         out[9 + i, 9 + i] = -inverse_tau[i]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _propagate(P: Any, transition: Any, noise: Any, dt: float) -> Any:
     """Φ P Φᵀ + Q; Q in the trapezoid form ½(Φ Q_c Φᵀ + Q_c)·dt, which also couples white noise into position."""
     work = P.copy()
@@ -117,7 +117,7 @@ def _propagate(P: Any, transition: Any, noise: Any, dt: float) -> Any:
     return P_next
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def forward(
     time: Any, gyro: Any, accel: Any, gap: Any,
     fix_time: Any, fix_position: Any, fix_velocity: Any, fix_variance: Any, fix_rate: Any, fix_size: Any,
@@ -293,7 +293,7 @@ def forward(
     return epoch + 1
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def backward(count: int, epoch_P: Any, epoch_phi: Any, epoch_fix: Any, H_all: Any, S_inv_all: Any, K_all: Any, innovation_all: Any, fix_size: Any, correction: Any, smoothed_P: Any) -> None:
     """Modified Bryson–Frazier recursion over the first `count` epochs.
 

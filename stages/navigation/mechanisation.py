@@ -34,7 +34,7 @@ KS = geodesy.SOMIGLIANA_K
 M = OMEGA**2 * A**3 * (1.0 - F) / geodesy.GM
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def gravity(latitude: float, height: float) -> Any:
     """`tsmftis.geodesy.normal_gravity` for one point."""
     s2 = math.sin(latitude) ** 2
@@ -42,14 +42,14 @@ def gravity(latitude: float, height: float) -> Any:
     return surface * (1.0 - 2.0 / A * (1.0 + F + M - 2.0 * F * s2) * height + 3.0 * (height / A) ** 2)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def radii(latitude: float) -> Any:
     """`tsmftis.geodesy.radii_of_curvature` for one point."""
     s = 1.0 - E2 * math.sin(latitude) ** 2
     return A * (1.0 - E2) / (s * math.sqrt(s)), A / math.sqrt(s)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def quaternion_to_dcm(q: Any, out: Any) -> None:
     w, x, y, z = q[0], q[1], q[2], q[3]
     out[0, 0] = 1.0 - 2.0 * (y * y + z * z)
@@ -71,7 +71,7 @@ def dcm_to_quaternion(dcm: np.ndarray) -> np.ndarray:
     return np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _multiply(p: Any, q: Any, out: Any) -> None:
     a, b, c, d = p[0], p[1], p[2], p[3]
     e, f, g, h = q[0], q[1], q[2], q[3]
@@ -81,7 +81,7 @@ def _multiply(p: Any, q: Any, out: Any) -> None:
     out[3] = a * h + b * g - c * f + d * e
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _from_vector(v: Any, out: Any) -> None:
     half2 = 0.25 * (v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     if half2 < 1e-8:
@@ -96,7 +96,7 @@ def _from_vector(v: Any, out: Any) -> None:
     out[3] = scale * v[2]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def rotate_ned(q: Any, phi: Any) -> None:
     """q ← exp(φ)·q with φ [rad] resolved in NED, in place, renormalised."""
     left = np.empty(4)
@@ -108,7 +108,7 @@ def rotate_ned(q: Any, phi: Any) -> None:
         q[i] = result[i] / norm
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def increments(gyro: Any, accel: Any, gyro_before: Any, accel_before: Any, dt: float, dt_before: float, theta: Any, dv: Any) -> None:
     """Rotation vector and velocity increment of one interval from mean rates, Savage's two-sample form [1]_.
 
@@ -129,7 +129,7 @@ def increments(gyro: Any, accel: Any, gyro_before: Any, accel_before: Any, dt: f
     dv[2] = uz + 0.5 * (ax * uy - ay * ux) + (bx * uy - by * ux) + (cx * ay - cy * ax)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def step(position: Any, velocity: Any, q: Any, dcm: Any, theta: Any, dv: Any, dt: float) -> None:
     """Advance latitude, longitude, height, NED velocity and attitude by one interval, in place; `dcm` follows q.
 

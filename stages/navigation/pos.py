@@ -276,15 +276,15 @@ def _quality(
     residual = _antenna_residuals(trajectory, gnss, s["lever"], used)
     steps = np.diff(imu.time)
     gaps = [{"start_s": float(imu.time[i]), "length_s": float(steps[i])} for i in np.flatnonzero(s["gap"][1:])]
-    expected = float(size[used].mean()) if used.any() else float("nan")
     quality = {
         "alignment": start.method,
         "passes": passes,
         "fixes": {"used": int(used.sum()), "rejected": int((seen & ~used).sum()), "outside_imu": int((~seen).sum())},
         "rejected_times_s": [float(t) for t in gnss.time[seen & ~used][:100]],
         "innovation_nis_mean": float(np.mean(nis[used])) if used.any() else None,
-        "innovation_nis_expected": expected,
-        "position_residual_rms_m": [float(v) for v in np.sqrt((residual**2).mean(axis=0))],
+        "innovation_nis_expected": float(size[used].mean()) if used.any() else None,
+        "position_residual_rms_m": float(np.sqrt((residual**2).sum(axis=1).mean())) if used.any() else None,
+        "position_residual_rms_ned_m": [float(v) for v in np.sqrt((residual**2).mean(axis=0))] if used.any() else [],
         "imu_gaps": gaps[:100],
         "imu_gap_count": len(gaps),
         "gyro_bias_deg_per_h": [float(v) for v in np.rad2deg(bias[:, 0:3].mean(axis=0)) * 3600],

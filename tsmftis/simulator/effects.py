@@ -1,8 +1,8 @@
 """Effects that the truth may hold and the declared instrument does not.
 
-Names, parameters, units and signs are those of the table "Effect names" in docs/campaign-format.md: a value is what must
-be ADDED to the declared model to match the data. How each arises stands where the physics is: `inertial`, `thermal`,
-`gnss`, `lens`, `interferometer`, `imaging`.
+Names, parameters, units and signs are those of the table "Effect names" in docs/campaign-format.md: a value is what
+must be ADDED to the declared model to match the data. How each arises stands where the physics is: `inertial`,
+`thermal`, `gnss`, `lens`, `interferometer`, `imaging`.
 """
 
 from __future__ import annotations

@@ -137,11 +137,12 @@ def gusts(sigma: Array, corner: float, cutoff: float, terms: int, rng: np.random
 
 
 def wobble(sigma: Array, cutoff: Array, terms: int, rng: np.random.Generator) -> Harmonics:
-    """Attitude disturbance in roll, pitch, yaw of sigma (3,) [rad]: S ∝ 1/(1 + (f/cutoff)⁸), each its own cutoff [Hz]."""
-    axes = [
-        harmonics.draw(lambda f, c=c: 1.0 / (1.0 + (f / c) ** 8), np.array([s]), (0.02 * c, 5.0 * c), terms, rng)  # type: ignore[misc]
-        for s, c in zip(sigma, cutoff, strict=True)
-    ]
+    """Disturbance of roll, pitch, yaw, sigma (3,) [rad]: S ∝ 1/(1 + (f/cutoff)⁸), each its own cutoff [Hz]."""
+
+    def axis(s: float, c: float) -> Harmonics:
+        return harmonics.draw(lambda f: 1.0 / (1.0 + (f / c) ** 8), np.array([s]), (0.02 * c, 5.0 * c), terms, rng)
+
+    axes = [axis(float(s), float(c)) for s, c in zip(sigma, cutoff, strict=True)]
     return Harmonics(
         *(np.concatenate([getattr(a, n) for a in axes]) for n in ("amplitude", "angular_frequency", "phase"))
     )

@@ -23,7 +23,7 @@ class Fixes:
 
 
 def antenna(flight: Flight, time: Array, lever_arm: Array) -> tuple[Array, Array]:
-    """ECEF position r + C·l [m] and velocity v + C·(ω×l) [m/s] of the antenna at l (3,) [m, body], times (n,) → (n, 3)."""
+    """ECEF position r + C·l [m], velocity v + C·(ω×l) [m/s] (n, 3) of the antenna at l (3,) [m, body], times (n,)."""
     attitude = flight.attitude(time)
     swing = np.cross(flight.angular_rate(time), lever_arm)
     return (
@@ -34,19 +34,19 @@ def antenna(flight: Flight, time: Array, lever_arm: Array) -> tuple[Array, Array
 
 def observe(
     flight: Flight,
-    stamp: Array,
+    time: Array,
     lever_arm: Array,
     latency: float,
     position_error: Array,
     velocity_error: Array,
 ) -> Fixes:
-    """Fixes stamped `stamp` = true time + latency; errors (n, 3) along NED [m], [m/s] are added."""
-    position, velocity = antenna(flight, stamp - latency, lever_arm)
-    lat, lon, height = geodesy.ecef_to_geodetic(position)
+    """Fixes at true times (n,), stamped true time + latency; errors (n, 3) along NED [m], [m/s] are added."""
+    position, velocity = antenna(flight, time, lever_arm)
+    lat, lon, _ = geodesy.ecef_to_geodetic(position)
     to_ecef = geodesy.ned_to_ecef_dcm(lat, lon)
     wrong = position + np.einsum("nij,nj->ni", to_ecef, position_error)
     return Fixes(
-        stamp,
+        time + latency,
         np.stack(geodesy.ecef_to_geodetic(wrong), -1),
         np.einsum("nji,nj->ni", to_ecef, velocity) + velocity_error,
     )

@@ -57,7 +57,7 @@ def draw(
     terms: int,
     rng: np.random.Generator,
 ) -> Harmonics:
-    """Independent channels of standard deviation sigma (channel,) and spectral density ∝ density(f [Hz]) in the band [Hz]."""
+    """Channels of standard deviation sigma (channel,) and spectral density ∝ density(f [Hz]) within the band [Hz]."""
     sigma = np.asarray(sigma, float)
     edges = np.geomspace(*band, terms + 1)
     frequency = edges[:-1] + rng.uniform(size=(sigma.size, terms)) * np.diff(edges)

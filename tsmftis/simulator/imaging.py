@@ -37,7 +37,7 @@ FLEXURE_CUTOFF = 12.0      # Hz
 class Mount:
     """How the camera sits on the body: lever arm (3,) [m], C_camera→body (3, 3), and its two weaknesses.
 
-    drift (3,) [rad/K]: rotation vector × (mean accelerometer temperature − 25 °C), in the body frame after the boresight.
+    drift (3,) [rad/K]: rotation vector × (mean accelerometer temperature − 25 °C), in the body frame after boresight.
     flexure (2,) [rad per rad/s²]: rotation about x and y by angular acceleration.
     """
 
@@ -48,7 +48,7 @@ class Mount:
 
 
 def angular_acceleration(end: Array, gyro: Array, rate: float) -> CubicSpline:
-    """dω/dt (3,) [rad/s²] as a function of time, from mean rates (n, 3) over intervals ending at (n,), sampled at rate [Hz].
+    """dω/dt (3,) [rad/s²] as a function of time, from mean rates (n, 3) over intervals ending at (n,); rate in Hz.
 
     Zero-phase second-order Butterworth low pass at 12 Hz, then the derivative of a spline.
     """
@@ -76,7 +76,7 @@ def camera_poses(
 
 @numba.njit(cache=True, inline="always")
 def _distance(px, py, pz, dx, dy, dz, height, north, west, d_lat, d_lon, guess):  # type: ignore[no-untyped-def]
-    """Distance along a ray to the terrain by fixed point on height; NaN where it leaves the terrain or does not settle."""
+    """Distance along a ray to the terrain, by fixed point on height; NaN where it leaves the terrain."""
     a, e2 = geodesy.SEMI_MAJOR_AXIS, geodesy.ECCENTRICITY_SQUARED
     b = a * np.sqrt(1.0 - e2)
     ep2 = e2 / (1.0 - e2)
@@ -125,7 +125,7 @@ def _cast(position, direction, height, north, west, d_lat, d_lon, guess):  # typ
 
 
 def cast(position: Array, direction: Array, terrain: Terrain) -> Array:
-    """ECEF points (n, 3) where rays from position (n, 3) along unit directions (n, 3) meet the terrain; NaN where not."""
+    """ECEF points (n, 3) where rays from position (n, 3) along unit directions (n, 3) meet the terrain, or NaN."""
     _, _, height = geodesy.ecef_to_geodetic(position)
     distance = _cast(
         np.ascontiguousarray(position), np.ascontiguousarray(direction), terrain.height, terrain.north, terrain.west,
@@ -169,7 +169,7 @@ def expose(
         signal, samples,
     )
     if np.isnan(frames).any():
-        raise ValueError("a ray of the camera leaves the terrain: the line is not flown level, or the margin is too small")
+        raise ValueError("a ray leaves the terrain: the line is not flown level, or terrain.margin_m is too small")
     return np.asarray(frames)
 
 
@@ -200,8 +200,10 @@ def _expose(  # type: ignore[no-untyped-def]
                     ground[i, j, 1] = axes[1, 0] * gx + axes[1, 1] * gy + axes[1, 2] * gz
             for i in range(rows):
                 for j in range(cols):
-                    a00, a01, a10, a11 = ground[i, j, 0], ground[i, j + 1, 0], ground[i + 1, j, 0], ground[i + 1, j + 1, 0]
-                    b00, b01, b10, b11 = ground[i, j, 1], ground[i, j + 1, 1], ground[i + 1, j, 1], ground[i + 1, j + 1, 1]
+                    a00, b00 = ground[i, j]
+                    a01, b01 = ground[i, j + 1]
+                    a10, b10 = ground[i + 1, j]
+                    a11, b11 = ground[i + 1, j + 1]
                     if np.isnan(a00 + a01 + a10 + a11):
                         out[f, i, j] = np.nan
                         continue
@@ -221,7 +223,11 @@ def _expose(  # type: ignore[no-untyped-def]
                             fc = (v + 0.5) / samples
                             a = (1 - fr) * ((1 - fc) * a00 + fc * a01) + fr * ((1 - fc) * a10 + fc * a11)
                             b = (1 - fr) * ((1 - fc) * b00 + fc * b01) + fr * ((1 - fc) * b10 + fc * b11)
-                            if near >= 0 and abs(a - centre[near, 0]) <= half[near] and abs(b - centre[near, 1]) <= half[near]:
+                            inside = near >= 0
+                            if inside:
+                                off = max(abs(a - centre[near, 0]), abs(b - centre[near, 1]))
+                                inside = off <= half[near]
+                            if inside:
                                 total += signal[material[near], i, j]
                             else:
                                 ia = int(np.floor((a - texture_corner[0]) / cell)) % na
@@ -235,7 +241,10 @@ def _expose(  # type: ignore[no-untyped-def]
 def digitise(
     signal: Array, dark: Array, electrons_per_dn: float, read_noise: float, saturation: int, rng: np.random.Generator
 ) -> NDArray[np.uint16]:
-    """Counts of the signal after dark (frame, row, col) [DN]: dark, shot noise (variance s/gain), read noise [DN], clip, round."""
+    """Counts of the signal after dark (frame, row, col) [DN].
+
+    Dark, shot noise of variance s/electrons_per_dn, read noise [DN] are added; then rounded and clipped at saturation.
+    """
     noise = rng.standard_normal(signal.shape, dtype=np.float32)
     sigma = np.sqrt(np.maximum(signal, 0.0) / electrons_per_dn + read_noise**2)
     return np.clip(np.rint(signal + dark + sigma * noise), 0, saturation).astype(np.uint16)

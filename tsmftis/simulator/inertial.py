@@ -60,7 +60,7 @@ def specific_force(position: Array, velocity: Array, acceleration: Array) -> Arr
 
 
 def sensed(flight: Flight, time: Array) -> tuple[Array, Array]:
-    """Angular rate against the inertial frame [rad/s] and specific force [m/s²] along body axes, at times (n,) → (n, 3)."""
+    """Rate against the inertial frame [rad/s] and specific force [m/s²] (n, 3) along body axes, at times (n,)."""
     attitude = flight.attitude(time)
     force = specific_force(flight.position(time), flight.velocity(time), flight.acceleration(time))
     rate = flight.angular_rate(time) + np.einsum("nji,j->ni", attitude, EARTH_ROTATION)
@@ -81,7 +81,7 @@ def interval_means(flight: Flight, end: Array, interval: float) -> tuple[Array, 
 
 
 def static(latitude: float, height: float, body_to_ned: Array) -> tuple[Array, Array]:
-    """Rate [rad/s] and specific force [m/s²] (3,) of a body at rest at latitude [rad], height [m], C_body→NED (3, 3)."""
+    """Rate [rad/s] and specific force [m/s²] (3,) of a body at rest at latitude [rad], height [m], C_body→NED."""
     to_body = body_to_ned.T @ geodesy.ned_to_ecef_dcm(latitude, 0.0).T
     position = geodesy.geodetic_to_ecef(latitude, 0.0, height)
     return to_body @ EARTH_ROTATION, to_body @ specific_force(position, np.zeros(3), np.zeros(3))

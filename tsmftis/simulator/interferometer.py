@@ -32,7 +32,7 @@ def channel_fringe(wavenumber: Array, amplitude: float, thickness: float, phase:
 def interferogram(
     opd: Array, wavenumber: Array, response: Array, radiance: Array, phase: Array, visibility: float
 ) -> Array:
-    """Signal [DN] at opd (...) [m] of the spectra radiance (material, wavenumber) → (material, ...), by the trapezoidal rule.
+    """Signal [DN] at opd (...) [m] of spectra radiance (material, wavenumber) → (material, ...), trapezoidal rule.
 
     wavenumber (k,) [m⁻¹], response (k,) [DN per radiance and m⁻¹], phase (k,) [rad].
     """

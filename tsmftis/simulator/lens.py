@@ -1,7 +1,7 @@
 """From a pixel to its ray, and back by search.
 
-With x = X/Z, y = Y/Z, s = 1 + k1·(x² + y²): row = row0 + s·y·f/p, col = col0 − s·x·f/p. The simulator goes from pixel to
-ray, so the radius r·(1 + k1·r²) is inverted numerically.
+With x = X/Z, y = Y/Z, s = 1 + k1·(x² + y²): row = row0 + s·y·f/p, col = col0 − s·x·f/p. The simulator goes from pixel
+to ray, so the radius r·(1 + k1·r²) is inverted numerically.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def ray(lens: Lens, row: Array, col: Array) -> Array:
 
 
 def find(lens: Lens, camera: Array, to_ecef: Array, point: Array) -> Array:
-    """The pixel (row, col) whose ray hits an ECEF point (3,), by Gauss–Newton on rays; camera (3,), C_camera→ECEF (3, 3).
+    """The pixel (row, col) whose ray hits an ECEF point (3,), by Newton on rays; camera (3,), C_camera→ECEF (3, 3).
 
     Raises ValueError where the point is behind the camera.
     """

@@ -1,4 +1,6 @@
-"""Spectra: what surfaces reflect, what lights them, what the instrument passes. Wavenumbers σ in m⁻¹, wavelengths in nm.
+"""Spectra: what surfaces reflect, what lights them, what the instrument passes.
+
+Wavenumbers σ in m⁻¹, wavelengths in nm.
 
 Functions
 ---------
@@ -49,7 +51,7 @@ def _peak(wavelength: Array, centre: float, width: float, height: float) -> Arra
 
 
 def illumination(wavenumber: Array) -> Array:
-    """Sunlight on the ground per unit wavenumber: Planck's σ³/(e^{c₂σ/T} − 1) at 5778 K through the sky; peak 1 without sky."""
+    """Sunlight on the ground per unit wavenumber: Planck's σ³/(e^{c₂σ/T} − 1) at 5778 K, peak 1, through the sky."""
     planck = wavenumber**3 / np.expm1(_SECOND_RADIATION * wavenumber / _SUN)
     peak = 2.8214393721 * _SUN / _SECOND_RADIATION     # Wien's law per unit wavenumber
     light = planck / (peak**3 / np.expm1(_SECOND_RADIATION * peak / _SUN))
@@ -87,7 +89,7 @@ def reflectance(name: str, wavenumber: Array) -> Array:
 def response(
     wavenumber: Array, peak: float, wavelength: float, width: float, band: tuple[float, float], edge: float
 ) -> Array:
-    """Fringe amplitude response: a Gaussian in wavelength [nm] between logistic edges of scale `edge` [m⁻¹] at the band [nm]."""
+    """Fringe amplitude response: a Gaussian in wavelength [nm] between logistic edges of scale `edge` [m⁻¹]."""
     low, high = 1e9 / band[1], 1e9 / band[0]
     inside = 1.0 / ((1.0 + np.exp((low - wavenumber) / edge)) * (1.0 + np.exp((wavenumber - high) / edge)))
     return peak * np.exp(-0.5 * ((1e9 / wavenumber - wavelength) / width) ** 2) * inside

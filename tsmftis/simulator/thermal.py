@@ -5,8 +5,8 @@ warmer than the air by its self-heating:
 
     τ_s ẏ_s = u − y_s,    τ_n ẏ_n = y_s − y_n,    T_n = y_n + offset_n.
 
-A gyro has the nodes anode, cathode, shell; an accelerometer has one. The bias of an axis is a smooth law of T, dT/dt and
-(gyro) the gradients anode − shell and cathode − shell, T the mean of the axis' nodes; the laws are drawn from a seed.
+A gyro has the nodes anode, cathode, shell; an accelerometer has one. The bias of an axis is a smooth law of T, dT/dt
+and (gyro) the gradients anode − shell and cathode − shell, T the mean of the axis' nodes; laws are drawn from a seed.
 
 Functions
 ---------
@@ -35,13 +35,13 @@ Array = NDArray[np.float64]
 
 
 def piecewise(start: float, stages: Sequence[tuple[float, float]], time: Array) -> Array:
-    """Air temperature [°C] at times (n,) [s]: from `start` to each target [°C] within each duration [s], straight lines."""
-    at = np.concatenate([[0.0], np.cumsum([duration for _, duration in stages])])
-    return np.interp(time, at, [start, *(target for target, _ in stages)])
+    """Air temperature [°C] at times (n,) [s]: straight lines from start through stages (duration [s], target [°C])."""
+    at = np.concatenate([[0.0], np.cumsum([duration for duration, _ in stages])])
+    return np.interp(time, at, [start, *(target for _, target in stages)])
 
 
 def lag(u: Array, time_constant: Array | float, step: float) -> Array:
-    """y of τẏ = u − y, in equilibrium at the start, exact for u straight between samples; (n, ...) along the first axis."""
+    """y of τẏ = u − y along the first axis, settled at the start, exact for u straight between samples."""
     tau = np.broadcast_to(np.asarray(time_constant, float), u.shape[1:])
     y = np.empty(u.shape)
     for index in np.ndindex(tau.shape):
@@ -70,10 +70,14 @@ class Nodes:
 
 
 def draw_nodes(
-    time_constant: Array, self_heating: Array, accel_time_constant: float, accel_self_heating: float, spread: float,
+    time_constant: Array,
+    self_heating: Array,
+    accel_time_constant: float,
+    accel_self_heating: float,
+    spread: float,
     rng: np.random.Generator,
 ) -> Nodes:
-    """Three axes around nominal values for (anode, cathode, shell) and the accelerometer; constants scatter by `spread`."""
+    """Three axes around nominal values (anode, cathode, shell; accelerometer); the constants scatter by `spread`."""
     return Nodes(
         np.asarray(time_constant) * (1.0 + spread * rng.uniform(-1.0, 1.0, (3, 3))),
         np.tile(np.asarray(self_heating, float), (3, 1)),
@@ -130,17 +134,24 @@ class Law:
 
 
 # Centre and half range of T [°C], dT/dt [K/s] and gradients [K] over the chamber's profiles.
-_CENTRE = np.array([15.0, 0.0, 4.0, 3.0])
-_HALF_RANGE = np.array([40.0, 0.02, 8.0, 8.0])
+_CENTRE = np.array([15.0, 0.0, 7.0, 5.0])
+_HALF_RANGE = np.array([45.0, 0.025, 12.0, 12.0])
+# How strongly laws bend along each: more along T, for a chamber run visits few mixtures of the others.
+_BEND = np.array([0.8, 0.35, 0.35, 0.35])
 
 
 def draw_law(features: int, amplitude: float, rng: np.random.Generator) -> Law:
-    """A law over the first `features` of (T, dT/dt, ∇T1, ∇T2) whose standard deviation over their range is `amplitude`."""
+    """A law of the first `features` of (T, dT/dt, ∇T1, ∇T2); its standard deviation over their range is `amplitude`."""
     terms = 3
+    bend = _BEND[:features]
     drawn = Law(
-        (rng.normal(0.0, 1.0, terms), rng.normal(0.0, 0.9, (terms, features)), rng.normal(0.0, 0.5, terms)),
-        (rng.normal(0.0, 0.5, terms), rng.normal(0.0, 0.9, (terms, features)), rng.uniform(0.0, 2.0 * np.pi, terms)),
-        rng.normal(0.0, 0.15, (features, features)),
+        (rng.normal(0.0, 1.0, terms), bend * rng.normal(0.0, 1.0, (terms, features)), rng.normal(0.0, 0.5, terms)),
+        (
+            rng.normal(0.0, 0.5, terms),
+            bend * rng.normal(0.0, 1.0, (terms, features)),
+            rng.uniform(0.0, 2.0 * np.pi, terms),
+        ),
+        rng.normal(0.0, 0.3, (features, features)) * np.outer(bend, bend),
         1.0,
     )
     spread = drawn(rng.uniform(-1.0, 1.0, (2000, features))).std()

@@ -74,7 +74,7 @@ def draw_terrain(
     rows, cols = int(np.ceil((north - south) / d_lat)), int(np.ceil((east - west) / d_lon))
     x = cell * (np.arange(cols) + 0.5)
     y = -cell * (np.arange(rows) + 0.5)
-    lengths = np.exp(rng.uniform(*np.log(wavelength), waves))
+    lengths = np.exp(rng.uniform(np.log(wavelength[0]), np.log(wavelength[1]), waves))
     amplitude = lengths * (relief / np.sqrt(0.5 * np.sum(lengths**2)))
     direction, phase = rng.uniform(0.0, 2.0 * np.pi, (2, waves))
     surface = np.full((rows, cols), height)
@@ -110,13 +110,12 @@ class Plane:
 
 def on_terrain(plane: Plane, terrain: Terrain, coordinates: Array) -> Array:
     """Latitude, longitude [rad], height [m] of the surface at plane coordinates (n, 2) [m] → (n, 3)."""
-    up = plane.origin / np.linalg.norm(plane.origin)
+    normal = np.cross(plane.across, plane.along)
     point = plane.origin + coordinates @ np.stack([plane.along, plane.across])
     for _ in range(20):
         lat, lon, height = geodesy.ecef_to_geodetic(point)
         # Up along the plane's normal: along and across stay as they are.
-        normal = np.cross(plane.across, plane.along)
-        point = point + (terrain.at(lat, lon) - height)[:, None] * normal * np.sign(normal @ up)
+        point = point + (terrain.at(lat, lon) - height)[:, None] * normal
     return np.stack(geodesy.ecef_to_geodetic(point), -1)
 
 

@@ -1,0 +1,1 @@
+"""YAML presets and the list of all settings; found through importlib.resources."""

@@ -1,0 +1,97 @@
+"""tsmftis run: a campaign in, spectra, trajectory, maps and scores out."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from flows.settings import load_settings
+from flows.steps import STAGES, Plan
+from pipeline.campaign import read_campaign
+from pipeline.errors import InputError
+from pipeline.inspect import check_campaign
+from pipeline.run_stage import StageRecord
+
+
+def run(
+    campaign: Annotated[Path, typer.Argument(help="Campaign folder (it holds campaign.yaml).")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the results; made if need be.")],
+    start: Annotated[str | None, typer.Option("--from", metavar="STAGE", help=f"Run this stage and those after it again: {', '.join(STAGES)}.")] = None,
+    only: Annotated[str | None, typer.Option("--only", metavar="STAGE", help="Run this stage alone, on the results that are there.")] = None,
+    line: Annotated[list[str] | None, typer.Option("--line", metavar="ID", help="Only this line (LINE or FLIGHT/LINE); may be repeated.")] = None,
+    assignments: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting, for instance navigation.epoch_s=0.05; may be repeated.")] = None,
+    settings_file: Annotated[Path | None, typer.Option("--settings", metavar="FILE", help="YAML file of settings (configs/settings.yaml lists all).")] = None,
+) -> None:
+    """Process a campaign. Only what changed since the last run into the same folder runs again.
+
+    Exit code 0: all done; 1: a stage failed (run.json says which); 2: the input or the options are wrong.
+    """
+    console = Console(highlight=False, soft_wrap=True)
+    settings = load_settings(settings_file, assignments or [])
+    for option, stage in (("--from", start), ("--only", only)):
+        if stage is not None and stage not in STAGES:
+            raise InputError(option, f"'{stage}'", "is no stage", f"use one of {', '.join(STAGES)}")
+    if start and only:
+        raise InputError("--from", "with --only", "contradict each other", "give one of them")
+    plan = Plan(campaign.resolve(), out.resolve(), settings, start, only, tuple(line or ()))
+    opened = read_campaign(campaign)
+    known = {i for f in opened.keys.flights for entry in f.lines for i in (entry.id, f"{f.id}/{entry.id}")}
+    if unknown := [i for i in plan.lines if i not in known]:
+        raise InputError("--line", f"'{unknown[0]}'", "is not in the campaign", f"use one of {', '.join(sorted(known)) or 'none: it has no lines'}")
+    if plan.out.exists() and not plan.out.is_dir():
+        raise InputError(out, "--out", "is a file", "give a folder")
+    if plan.out == plan.campaign or plan.campaign.is_relative_to(plan.out):
+        raise InputError(out, "--out", "would write into the campaign's own place", "give another folder")
+    inspection = check_campaign(opened)
+    for warning in inspection.warnings:
+        console.print(f"warning: {warning}", style="yellow", markup=False)
+    plan.out.mkdir(parents=True, exist_ok=True)
+
+    started = time.perf_counter()
+    # Prefect takes seconds to import: bad input has been answered by now.
+    from flows.campaign import run_campaign
+    from flows.results import assemble, write_run
+    from pipeline.report import write_report
+
+    def say(record: StageRecord) -> None:
+        status = "failed" if record.status == "failed" else "unchanged" if record.cached else f"{record.seconds:.1f} s"
+        console.print(f"{record.stage:<15}{record.unit:<18}{status}", markup=False)
+        if record.error:
+            console.print(f"  {record.error}", style="red", markup=False)
+
+    records = run_campaign(plan, say)
+    content = assemble(plan, records)
+    write_run(plan, content)
+    report = write_report(opened, plan.out, content, settings.model_dump(mode="json"), inspection.warnings)
+    print_scores(console, content)
+    console.print(f"report: {_short(report)}   ({time.perf_counter() - started:.0f} s)", markup=False)
+    if any(record.status == "failed" for record in records):
+        raise typer.Exit(1)
+
+
+def print_scores(console: Console, content: dict[str, Any]) -> None:
+    """The RQE table of a run, if it has scores."""
+    if not content.get("rqe"):
+        return
+    table = Table(title="RQE, mean over all targets", show_edge=False, header_style="bold", pad_edge=False, title_justify="left")
+    table.add_column("method")
+    for name in ("one point", "area mean"):
+        table.add_column(name, justify="right")
+    for method, value in content["rqe"].items():
+        area = content["rqe_area"].get(method)
+        table.add_row(method, f"{value:.4f}", "–" if area is None else f"{area:.4f}")
+    console.print(table)
+    for method, targets in content["partly_seen"].items():
+        console.print(f"not seen well enough under {method}: {', '.join(targets)}", markup=False)
+
+
+def _short(path: Path) -> Path:
+    try:
+        return path.relative_to(Path.cwd())
+    except ValueError:
+        return path

@@ -1,0 +1,94 @@
+"""run.json: what the stages' records say, in the contract's form."""
+
+from __future__ import annotations
+
+import json
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from flows.steps import STAGES, Plan
+from pipeline.run_stage import FOLDER, StageRecord, write_json
+from stages.scoring import campaign_means
+from tsmftis import __version__
+
+SCHEMA = "tsmftis-run/1"
+PACKAGES = ("numpy", "scipy", "torch", "numba", "opencv-python-headless", "rasterio", "xarray", "prefect")
+
+
+def assemble(plan: Plan, records: list[StageRecord]) -> dict[str, Any]:
+    """The content of run.json from this run's records and, for units it did not touch, from those of earlier runs."""
+    known = _earlier(plan.out) | {(r.stage, r.unit): r for r in records}
+    keys = plan.opened.keys
+    units = _units(plan)
+    stages: dict[str, dict[str, Any]] = {}
+    for stage in STAGES:
+        for unit in units[stage]:
+            if record := known.get((stage, unit)):
+                entry = {"status": record.status, "seconds": record.seconds, "digest": record.digest}
+                stages.setdefault(stage, {})[unit] = entry | ({"error": record.error} if record.error else {})
+
+    def summary(stage: str, unit: str) -> dict[str, Any] | None:
+        record = known.get((stage, unit))
+        return None if record is None or record.status == "failed" else record.summary
+
+    flights: dict[str, Any] = {}
+    partly: dict[str, list[str]] = {}
+    for flight in keys.flights:
+        lines: dict[str, Any] = {}
+        for line in flight.lines:
+            unit = f"{flight.id}/{line.id}"
+            if not any(unit in s for s in stages.values()):
+                continue
+            score = summary("scoring", unit) or {"scores": {"rqe": {}, "rqe_area": {}}, "partly_seen": {}}
+            lines[line.id] = {
+                "rqe": score["scores"]["rqe"], "rqe_area": score["scores"]["rqe_area"],
+                **{s: summary(s, unit) for s in ("tracking", "registration", "reconstruction", "mapping") if summary(s, unit)},
+            }
+            for method, targets in score["partly_seen"].items():
+                partly.setdefault(method, []).extend(f"{unit}/{t}" for t in targets)
+        flights[flight.id] = {"navigation": summary("navigation", flight.id), "lines": lines}
+    means = campaign_means([line for flight in flights.values() for line in flight["lines"].values()])
+    content: dict[str, Any] = {
+        "schema": SCHEMA, "campaign": keys.name, **means, "partly_seen": partly, "flights": flights,
+        "bench": {b.id: s for b in keys.bench if (s := summary("bench", b.id)) is not None},
+        "stages": stages, "provenance": _provenance(plan),
+    }
+    if (verification := summary("thermal", "campaign")) is not None:
+        content["thermal"] = verification
+    return content
+
+
+def write_run(plan: Plan, content: dict[str, Any]) -> Path:
+    path = plan.out / "run.json"
+    write_json(path, content)
+    return path
+
+
+def _units(plan: Plan) -> dict[str, list[str]]:
+    keys = plan.opened.keys
+    flights = [f.id for f in keys.flights]
+    lines = [f"{f.id}/{line.id}" for f in keys.flights for line in f.lines]
+    special = {"thermal": ["campaign"] if keys.thermal else [], "navigation": flights, "bench": [b.id for b in keys.bench]}
+    return {stage: special.get(stage, lines) for stage in STAGES}
+
+
+def _earlier(out: Path) -> dict[tuple[str, str], StageRecord]:
+    found = {}
+    for path in sorted((out / FOLDER).glob("*.json")):
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError:
+            continue
+        stage, _, unit = path.stem.partition("@")
+        unit = unit.replace("@", "/")
+        found[stage, unit] = StageRecord(stage, unit, "done", True, content["seconds"], content["key"], content["summary"])
+    return found
+
+
+def _provenance(plan: Plan) -> dict[str, Any]:
+    return {
+        "tsmftis": __version__, "python": platform.python_version(), "packages": {name: version(name) for name in PACKAGES},
+        "settings": plan.settings.model_dump(mode="json"),
+    }

@@ -1,0 +1,349 @@
+"""Each stage as a cached step on files: what it reads, what it writes, which settings it hangs on.
+
+A step is ten lines around `stages.<name>.run`: records in from files, records out to files, `pipeline.run_stage` deciding
+whether it has to run at all. No science here, and no Prefect: `flows.campaign` wraps steps as tasks.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rasterio.transform import Affine
+from rasterio.windows import Window
+
+from flows.settings import Settings
+from pipeline.campaign import Campaign, read_campaign
+from pipeline.datasets import write_dataset
+from pipeline.errors import InputError
+from pipeline.formats import sbet
+from pipeline.raster import Dem, open_cube
+from pipeline.records import CameraPoses, Imu, Spectra, ThermalCorrection, Tracks, Trajectory
+from pipeline.run_stage import StageRecord, run_stage, write_json
+from stages import bench as bench_stage
+from stages import mapping, navigation, reconstruction, registration, scoring, thermal, tracking
+from tsmftis.fourier import smooth_phase
+
+STAGES = ("thermal", "navigation", "tracking", "registration", "reconstruction", "mapping", "scoring", "bench")
+
+Paths = Mapping[str, Path]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run is about: plain data, handed to every task."""
+
+    campaign: Path
+    out: Path
+    settings: Settings = field(default_factory=Settings)
+    start: str | None = None                    # --from: this stage and those after it run again
+    only: str | None = None                     # --only: this stage alone
+    lines: tuple[str, ...] = ()                 # --line: LINE or FLIGHT/LINE; empty: all
+
+    @cached_property
+    def opened(self) -> Campaign:
+        return read_campaign(self.campaign)
+
+    def wants(self, flight: str, line: str) -> bool:
+        return not self.lines or line in self.lines or f"{flight}/{line}" in self.lines
+
+    def does(self, stage: str) -> bool:
+        """Whether a stage is looked at: with --only, the stages up to that one, and only it may run."""
+        return self.only is None or STAGES.index(stage) <= STAGES.index(self.only)
+
+    def switches(self, stage: str) -> dict[str, bool]:
+        if self.only is not None:
+            return {"force": stage == self.only, "forbid": stage != self.only}
+        return {"force": self.start is not None and STAGES.index(stage) >= STAGES.index(self.start), "forbid": False}
+
+
+def _plain(value: Any) -> Any:
+    """Parameters and figures as JSON data."""
+    if hasattr(value, "__dataclass_fields__"):
+        return {n: _plain(getattr(value, n)) for n in value.__dataclass_fields__}
+    if hasattr(value, "model_dump"):
+        return value.model_dump(mode="json")
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+
+def thermal_step(plan: Plan) -> StageRecord:
+    """Chamber runs → thermal_model.nc, thermal_figures.json; the verification is the summary."""
+    campaign = plan.opened
+    keys = campaign.keys.thermal
+    assert keys is not None
+    names = [*keys.train, *keys.verify]
+
+    def work(to: Paths) -> dict[str, Any]:
+        result = thermal.run(
+            [campaign.chamber(n) for n in keys.train], [campaign.chamber(n) for n in keys.verify], plan.settings.thermal
+        )
+        write_dataset(result.model.to_dataset(), to["model"])
+        write_json(to["figures"], _plain(result.figures))
+        return {"verify": result.verification, "notes": list(result.notes)}
+
+    return run_stage(
+        plan.out, "thermal", "campaign", "stages.thermal",
+        {"settings": _plain(plan.settings.thermal), "train": list(keys.train), "verify": list(keys.verify)},
+        {n: campaign.path(n) for n in names}, {"model": "thermal_model.nc", "figures": "thermal_figures.json"}, work,
+        **plan.switches("thermal"),
+    )
+
+
+def navigation_step(plan: Plan, flight: str) -> StageRecord:
+    """IMU, GNSS and the thermal model → trajectory.nc, trajectory.sbet, navigation.json (and thermal.nc, the correction)."""
+    campaign = plan.opened
+    entry, instrument = campaign.flight(flight), campaign.instrument
+    model = plan.out / "thermal_model.nc"
+    inputs = {"imu": campaign.path(entry.imu), "gnss": campaign.path(entry.gnss)}
+    outputs = {n: f"{flight}/{f}" for n, f in (("trajectory", "trajectory.nc"), ("sbet", "trajectory.sbet"), ("figures", "navigation.json"))}
+    if compensated := campaign.keys.thermal is not None and _has_temperatures(campaign, flight):
+        inputs["model"] = _needed(model, "thermal")
+        outputs["correction"] = f"{flight}/thermal.nc"
+
+    def work(to: Paths) -> dict[str, Any]:
+        imu = campaign.imu(flight)
+        correction = _correction(model, imu) if compensated else None
+        assert instrument.imu is not None and instrument.mounting is not None
+        result = navigation.run(
+            imu, campaign.gnss(flight), instrument.imu, instrument.mounting, plan.settings.navigation,
+            initial=_initial(campaign, flight), correction=correction,
+        )
+        if correction is not None:
+            write_dataset(correction.to_dataset(), to["correction"])
+        write_dataset(result.trajectory.to_dataset(), to["trajectory"])
+        sbet.write_sbet(sbet.from_trajectory(result.trajectory), to["sbet"])
+        write_json(to["figures"], {"quality": result.quality, "figures": result.figures})
+        return result.quality | {"compensated": compensated}
+
+    return run_stage(
+        plan.out, "navigation", flight, "stages.navigation",
+        {
+            "settings": _plain(plan.settings.navigation), "imu": _plain(instrument.imu), "initial": _plain(entry.initial),
+            "antenna": _plain(instrument.mounting.imu_to_antenna if instrument.mounting else None),
+            "imu_to_body": _plain(instrument.mounting.imu_to_body if instrument.mounting else None),
+        },
+        inputs, outputs, work, **plan.switches("navigation"),
+    )
+
+
+def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
+    """Trajectory, frame times and targets → pos_tracks.nc (nominal and tracking) and poses.nc."""
+    campaign = plan.opened
+    entry, instrument = campaign.line(flight, line), campaign.instrument
+    trajectory = plan.out / flight / "trajectory.nc"
+
+    def work(to: Paths) -> dict[str, Any]:
+        assert instrument.camera is not None and instrument.mounting is not None
+        result = tracking.run(
+            Trajectory.from_file(trajectory), campaign.frames(flight, line).time, campaign.targets(flight, line),
+            instrument.camera, instrument.mounting, plan.settings.tracking,
+        )
+        write_dataset(result.tracks.to_dataset(), to["tracks"])
+        write_dataset(result.poses.to_dataset(), to["poses"])
+        return {"course_deg": float(np.rad2deg(result.course)) % 360.0, "ground_speed_m_per_s": result.ground_speed, "range_m": result.range}
+
+    return run_stage(
+        plan.out, "tracking", f"{flight}/{line}", "stages.tracking",
+        {"settings": _plain(plan.settings.tracking), "camera": _plain(instrument.camera), "mounting": _plain(instrument.mounting)},
+        {"trajectory": _needed(trajectory, "navigation"), "frames": campaign.path(entry.frames), "targets": campaign.path(entry.targets)},
+        {"tracks": f"{flight}/{line}/pos_tracks.nc", "poses": f"{flight}/{line}/poses.nc"}, work, **plan.switches("tracking"),
+    )
+
+
+def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
+    """Frames and the POS tracks' anchors → tracks.nc with all methods."""
+    campaign = plan.opened
+    source = plan.out / flight / line / "pos_tracks.nc"
+    camera = campaign.instrument.camera
+    assert camera is not None
+
+    def work(to: Paths) -> dict[str, Any]:
+        tracks = Tracks.from_file(source)
+        by_pos = tracks.methods.index("tracking")
+        followed = registration.run(
+            campaign.frames(flight, line), Tracks(("tracking",), tracks.targets, tracks.row[[by_pos]], tracks.col[[by_pos]]),
+            camera, plan.settings.registration,
+        )
+        write_dataset(tracks.joined(followed).to_dataset(), to["tracks"])
+        return dict(followed.notes)
+
+    return run_stage(
+        plan.out, "registration", f"{flight}/{line}", "stages.registration", {"settings": _plain(plan.settings.registration)},
+        {"tracks": _needed(source, "tracking"), "frames": campaign.path(campaign.line(flight, line).frames)},
+        {"tracks": f"{flight}/{line}/tracks.nc"}, work, **plan.switches("registration"),
+    )
+
+
+def reconstruction_step(plan: Plan, flight: str, line: str) -> StageRecord:
+    """Frames and tracks → spectra.nc as scored, interferograms.nc."""
+    campaign = plan.opened
+    entry, instrument = campaign.line(flight, line), campaign.instrument
+    folder = plan.out / flight / line
+    inputs = {
+        "tracks": _needed(folder / "tracks.nc", "registration"), "frames": campaign.path(entry.frames),
+        "targets": campaign.path(entry.targets), "calibration": campaign.path(campaign.keys.calibration or ""),
+    }
+    if campaign.keys.references is not None:
+        inputs["references"] = campaign.path(campaign.keys.references)
+
+    def work(to: Paths) -> dict[str, Any]:
+        assert instrument.camera is not None and instrument.interferometer is not None
+        result = reconstruction.run(
+            campaign.frames(flight, line), Tracks.from_file(folder / "tracks.nc"), campaign.targets(flight, line), campaign.calibration(),
+            campaign.references() if campaign.keys.references is not None else None,
+            instrument.camera, instrument.interferometer, plan.settings.reconstruction,
+        )
+        write_dataset(result.spectra.to_dataset(), to["spectra"])
+        write_dataset(result.interferograms.to_dataset(), to["interferograms"])
+        return {"phase": result.phase.tolist(), "read_variance_dn2": result.read_variance, "gain_dn": result.gain}
+
+    return run_stage(
+        plan.out, "reconstruction", f"{flight}/{line}", "stages.reconstruction",
+        {"settings": _plain(plan.settings.reconstruction), "camera": _plain(instrument.camera), "interferometer": _plain(instrument.interferometer)},
+        inputs, {"spectra": f"{flight}/{line}/spectra.nc", "interferograms": f"{flight}/{line}/interferograms.nc"}, work,
+        **plan.switches("reconstruction"),
+    )
+
+
+def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
+    """Frames, poses, terrain and the line's phase → cube.tif and quicklook.png."""
+    campaign = plan.opened
+    entry, instrument = campaign.line(flight, line), campaign.instrument
+    folder = plan.out / flight / line
+    settings = plan.settings.mapping
+    inputs = {
+        "poses": _needed(folder / "poses.nc", "tracking"), "spectra": _needed(folder / "spectra.nc", "reconstruction"),
+        "frames": campaign.path(entry.frames), "calibration": campaign.path(campaign.keys.calibration or ""), "targets": campaign.path(entry.targets),
+    }
+    if campaign.keys.dem is not None:
+        inputs["dem"] = campaign.path(campaign.keys.dem)
+
+    def work(to: Paths) -> dict[str, Any]:
+        camera, interferometer = instrument.camera, instrument.interferometer
+        assert camera is not None and interferometer is not None
+        targets, poses = campaign.targets(flight, line), CameraPoses.from_file(folder / "poses.nc")
+        dem = None if campaign.keys.dem is None else Dem.from_file(inputs["dem"])
+        flat = float(targets.height.mean())
+        heights = (lambda lat, lon: np.full(np.shape(lat), flat)) if dem is None else dem.height
+        ground = flat if dem is None else float(dem.height(targets.latitude, targets.longitude).mean())
+        grid = mapping.line_grid(poses, camera, ground, settings)
+        scored = interferometer.scored_wavenumbers()
+        coefficients = np.array([float(c) for c in str(Spectra.from_file(folder / "spectra.nc").attributes["phase_coefficients"]).split()])
+        wavenumber = interferometer.scored_wavenumbers(settings.wavenumber_step_per_m)
+        phase = np.interp(wavenumber, scored, smooth_phase(coefficients, scored))
+        quicklook = _Quicklook(grid.shape, wavenumber)
+        with open_cube(to["cube"], grid.crs, Affine(*grid.affine), grid.shape, 1e9 / wavenumber) as cube:
+            for start, strip in mapping.run(
+                campaign.frames(flight, line), poses, heights, grid, wavenumber, phase, campaign.calibration(), camera, interferometer, settings
+            ):
+                cube.write(np.moveaxis(strip, 2, 0), window=Window(0, start, strip.shape[1], strip.shape[0]))
+                quicklook.add(start, strip)
+        quicklook.write(to["quicklook"])
+        return {
+            "cells": list(grid.shape), "cell_m": grid.cell, "crs": grid.crs, "bands": wavenumber.size,
+            "seen_fraction": quicklook.seen_fraction, "terrain": "dem" if dem is not None else f"flat at {flat:.1f} m",
+        }
+
+    return run_stage(
+        plan.out, "mapping", f"{flight}/{line}", "stages.mapping",
+        {"settings": _plain(settings), "camera": _plain(instrument.camera), "interferometer": _plain(instrument.interferometer)},
+        inputs, {"cube": f"{flight}/{line}/cube.tif", "quicklook": f"{flight}/{line}/quicklook.png"}, work, **plan.switches("mapping"),
+    )
+
+
+class _Quicklook:
+    """An RGB picture of the cube, gathered strip by strip: 640, 550, 460 nm or what the range has nearest to them."""
+
+    def __init__(self, shape: tuple[int, int], wavenumber: np.ndarray) -> None:
+        wavelength = 1e9 / wavenumber
+        spread = np.clip([460.0, 550.0, 640.0], wavelength.min(), wavelength.max())
+        self.bands = [int(np.argmin(np.abs(wavelength - w))) for w in spread]
+        self.image = np.full((*shape, 3), np.nan, np.float32)
+
+    def add(self, start: int, strip: np.ndarray) -> None:
+        self.image[start : start + strip.shape[0]] = strip[:, :, self.bands]
+
+    @property
+    def seen_fraction(self) -> float:
+        return float(np.isfinite(self.image[..., 0]).mean())
+
+    def write(self, path: Path) -> None:
+        """8 bit, each colour stretched to its 1st to 99th percentile; unseen cells are transparent. Flown upwards."""
+        seen = np.isfinite(self.image).all(axis=2)
+        scaled = np.zeros_like(self.image)
+        if seen.any():
+            low, high = np.percentile(self.image[seen], [1, 99], axis=0)
+            scaled[seen] = np.clip((self.image[seen] - low) / np.maximum(high - low, 1e-12), 0.0, 1.0)
+        picture = np.dstack([(255 * np.sqrt(scaled)).astype(np.uint8), (255 * seen).astype(np.uint8)])
+        cv2.imwrite(str(path), picture[::-1])
+
+
+def scoring_step(plan: Plan, flight: str, line: str) -> StageRecord:
+    """spectra.nc → scores.json."""
+    spectra = plan.out / flight / line / "spectra.nc"
+
+    def work(to: Paths) -> dict[str, Any]:
+        result = scoring.run(Spectra.from_file(spectra))
+        content = {"scores": result.scores, "partly_seen": result.partly_seen}
+        write_json(to["scores"], content)
+        return content
+
+    return run_stage(
+        plan.out, "scoring", f"{flight}/{line}", "stages.scoring", {}, {"spectra": _needed(spectra, "reconstruction")},
+        {"scores": f"{flight}/{line}/scores.json"}, work, **plan.switches("scoring"),
+    )
+
+
+def bench_step(plan: Plan, bench: str) -> StageRecord:
+    """A laboratory interferogram → bench/<id>.nc."""
+    campaign = plan.opened
+    entry = next(b for b in campaign.keys.bench if b.id == bench)
+
+    def work(to: Paths) -> dict[str, Any]:
+        result = bench_stage.run(campaign.bench(bench), plan.settings.bench)
+        write_dataset(result.to_dataset(), to["spectrum"])
+        return {"relative_rms": result.relative_rms, "relative_rms_scaled": result.relative_rms_scaled, "scale": result.scale, "notes": list(result.notes)}
+
+    return run_stage(
+        plan.out, "bench", bench, "stages.bench", {"settings": _plain(plan.settings.bench)}, {"interferogram": campaign.path(entry.file)},
+        {"spectrum": f"bench/{bench}.nc"}, work, **plan.switches("bench"),
+    )
+
+
+def _needed(path: Path, stage: str) -> Path:
+    if not path.exists():
+        raise InputError(path, "file", "is not there", f"run stage {stage} first: `--from {stage}` or no stage option")
+    return path
+
+
+def _has_temperatures(campaign: Campaign, flight: str) -> bool:
+    return campaign.imu(flight).temperatures is not None
+
+
+def _correction(model: Path, imu: Imu) -> ThermalCorrection:
+    assert imu.temperatures is not None
+    return thermal.ThermalModel.from_file(model).correction(imu.temperatures)
+
+
+def _initial(campaign: Campaign, flight: str) -> tuple[float, np.ndarray, np.ndarray] | None:
+    keys = campaign.flight(flight).initial
+    if keys is None:
+        return None
+    return (
+        keys.time_s, np.deg2rad([keys.roll_deg, keys.pitch_deg, keys.yaw_deg]),
+        np.deg2rad([keys.sigma_roll_deg, keys.sigma_pitch_deg, keys.sigma_yaw_deg]),
+    )
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8"))

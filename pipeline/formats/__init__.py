@@ -1,0 +1,1 @@
+"""Other people's file formats, to records and back: `sbet` (trajectories), `opus` (laboratory interferograms)."""

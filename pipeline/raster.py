@@ -1,0 +1,90 @@
+"""Rasters by rasterio: the terrain's heights in, georeferenced cubes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from rasterio.errors import RasterioError
+from rasterio.transform import Affine
+from rasterio.warp import transform as warp
+from scipy.ndimage import map_coordinates
+
+from pipeline.errors import InputError
+
+Array = NDArray[np.float64]
+WGS84 = "EPSG:4326"
+
+
+@dataclass(frozen=True)
+class Dem:
+    """Ellipsoidal heights (row, col) [m] on a raster of any CRS; `constant` surfaces have no raster."""
+
+    heights: Array
+    inverse: Affine
+    crs: str
+
+    @classmethod
+    def from_file(cls, path: Path) -> Dem:
+        """Raises InputError for an unreadable raster, one without CRS, or one with holes."""
+        try:
+            with rasterio.open(path) as source:
+                if source.crs is None:
+                    raise InputError(path, "CRS", "is missing", "write the DEM with its coordinate reference system")
+                heights = source.read(1, masked=True)
+                inverse, crs = ~source.transform, source.crs.to_wkt()
+        except RasterioError as error:
+            raise InputError(path, "file", f"is no readable raster ({type(error).__name__})", "write it as GeoTIFF; it may be truncated") from error
+        values = np.asarray(heights.filled(np.nan), float)
+        if not np.isfinite(values).all():
+            raise InputError(path, "band 1", f"has {int((~np.isfinite(values)).sum())} cells without height", "fill the holes of the DEM")
+        return cls(values, inverse, crs)
+
+    def height(self, latitude: Array, longitude: Array) -> Array:
+        """Bilinear height [m] at geodetic positions [rad]; beyond the edge the edge's height holds on."""
+        lon, lat = np.rad2deg(longitude).ravel(), np.rad2deg(latitude).ravel()
+        x, y = (lon, lat) if rasterio.crs.CRS.from_user_input(self.crs) == rasterio.crs.CRS.from_epsg(4326) else map(np.array, warp(WGS84, self.crs, lon, lat))
+        col, row = self.inverse * (x, y)
+        # Pixel centres lie half a pixel inside the corner that the transform refers to.
+        at = map_coordinates(self.heights, [np.asarray(row) - 0.5, np.asarray(col) - 0.5], order=1, mode="nearest")
+        return at.reshape(np.shape(latitude))
+
+    def covers(self, latitude: float, longitude: float) -> bool:
+        """Whether a geodetic position [rad] lies on the raster."""
+        (x,), (y,) = warp(WGS84, self.crs, [float(np.rad2deg(longitude))], [float(np.rad2deg(latitude))])
+        col, row = self.inverse * (x, y)
+        return 0 <= col <= self.heights.shape[1] and 0 <= row <= self.heights.shape[0]
+
+
+def utm_crs(latitude: float, longitude: float) -> str:
+    """EPSG code of the WGS-84 UTM zone of a position [rad]."""
+    zone = int((np.rad2deg(longitude) + 180.0) // 6.0) % 60 + 1
+    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+
+
+def to_crs(crs: str, latitude: Array, longitude: Array) -> tuple[Array, Array]:
+    """Geodetic [rad] → easting, northing [m]."""
+    x, y = warp(WGS84, crs, np.rad2deg(longitude).ravel(), np.rad2deg(latitude).ravel())
+    return np.reshape(x, np.shape(latitude)), np.reshape(y, np.shape(latitude))
+
+
+def from_crs(crs: str, x: Array, y: Array) -> tuple[Array, Array]:
+    """Easting, northing [m] → geodetic latitude, longitude [rad]."""
+    lon, lat = warp(crs, WGS84, x.ravel(), y.ravel())
+    return np.deg2rad(np.reshape(lat, x.shape)), np.deg2rad(np.reshape(lon, x.shape))
+
+
+def open_cube(path: Path, crs: str, transform: Affine, shape: tuple[int, int], wavelengths_nm: Array) -> rasterio.io.DatasetWriter:
+    """A GeoTIFF opened for writing: float32, tiled, one band a wavenumber, NaN where unseen, wavelengths as descriptions."""
+    target = rasterio.open(
+        path, "w", driver="GTiff", crs=crs, transform=transform, height=shape[0], width=shape[1],
+        count=len(wavelengths_nm), dtype="float32", nodata=np.nan, tiled=True, blockxsize=128, blockysize=128,
+        interleave="band", BIGTIFF="IF_SAFER",
+    )
+    for band, wavelength in enumerate(wavelengths_nm, start=1):
+        target.set_band_description(band, f"{wavelength:.3f} nm")
+    target.update_tags(wavelength_units="nm", quantity="spectral radiance, reference radiance unit")
+    return target

@@ -1,0 +1,49 @@
+"""What a user may choose about the thermal model; units are in the names."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class ThermalSettings(BaseModel):
+    """Settings of the thermal stage.
+
+    Times are time constants in seconds, never samples, so that chamber and flight are treated alike at any sampling.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    block_s: Positive = 60.0
+    """Targets are means over this time: short against the thermal time constants, long against the noise."""
+    smoothing_s: Positive = 30.0
+    """Time constant of the smoothing and differentiation of the thermometers."""
+    causal: bool = False
+    """Smooth with the past alone (as a real-time system must) instead of with past and future; Ṫ then comes a time
+    constant late, which costs accuracy wherever the ramp changes."""
+    centres: Annotated[int, Field(ge=4)] = 80
+    """Most Gaussian units a channel may have."""
+    start_widths: tuple[tuple[Positive, Positive], ...] = Field(default=((0.5, 5.0), (2.0, 2.0)), min_length=1)
+    """From where the search for the most probable widths starts: pairs of the width in T and that in Ṫ and ∇T, in
+    standard deviations of the features. The evidence often has two maxima: wavy in T and straight in the rest, or
+    alike in all."""
+    iterations: Count = 100
+    """Most steps of that search."""
+    verification_block_s: Positive = 100.0
+    """The verification figures are standard deviations of means over this time."""
+    minimum_span_k: Positive = 2.0
+    """A chamber run in which a channel's temperature moves less teaches it nothing."""
+    polynomial_degrees: tuple[Count, ...] = Field(default=(1, 2, 3, 4, 5), min_length=1)
+    """Degrees among which cross-validation chooses for the polynomial in T."""
+    rbf_nodes: tuple[Count, ...] = Field(default=(4, 6, 10, 15, 25, 40), min_length=1)
+    """Numbers of nodes among which cross-validation chooses for the traditional RBF."""
+    rbf_widths: tuple[Positive, ...] = Field(default=(0.7, 1.0, 1.5, 2.5, 4.0, 7.0), min_length=1)
+    """Widths among which cross-validation chooses for the traditional RBF, in standard deviations of the features."""
+    seed: Annotated[int, Field(ge=0)] = 0
+    """Of the k-means that places the traditional RBF's nodes; the Bayesian network needs none."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where the Bayesian network is trained."""

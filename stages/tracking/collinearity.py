@@ -1,0 +1,134 @@
+"""Collinearity: trajectory, mounting and camera say on which row and column a ground point falls in each frame.
+
+p_camera = C_camera→ECEFᵀ·(P_point − P_camera), then the camera's projection. The pose is taken at the frame's true time,
+stamp − latency, by splines through the trajectory.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.interpolate import CubicHermiteSpline
+
+from pipeline.errors import InputError
+from pipeline.records import CameraPoses, Targets, Tracks, Trajectory
+from tsmftis.camera import Camera, Mounting, camera_pose
+from tsmftis.geodesy import ecef_to_geodetic, geodetic_to_ecef, ned_to_ecef_dcm, radii_of_curvature
+from tsmftis.rotation import Attitude, rpy_to_dcm
+
+Array = NDArray[np.float64]
+
+MARGIN_S = 0.25         # trajectory kept beyond the line's ends, so that the splines have no end inside it
+
+
+class TrackingSettings(BaseModel):
+    """How far a target may lie from the flight before its coordinates are taken for wrong."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    farthest_target_m: float = Field(50_000.0, gt=0, description="a target farther from the line than this is an error in its coordinates")
+
+
+@dataclass(frozen=True)
+class TrackingResult:
+    """Tracks of `nominal` and `tracking`, the camera's pose in each frame, mean course [rad], ground speed [m/s], range [m]."""
+
+    tracks: Tracks
+    poses: CameraPoses
+    course: float
+    ground_speed: float
+    range: float
+
+
+def run(
+    trajectory: Trajectory, stamps: Array, targets: Targets, camera: Camera, mounting: Mounting, settings: TrackingSettings
+) -> TrackingResult:
+    """Tracks of every point of every target through the frames with these time stamps [s].
+
+    Raises InputError where the frames lie outside the trajectory or a target lies nowhere near the line.
+    """
+    time = stamps - camera.latency
+    poses = camera_poses(trajectory, time, mounting)
+    inside = np.isfinite(poses.centre[:, 0])
+    if inside.sum() < 2:
+        raise InputError(
+            "frames", "variable 'time'",
+            f"spans {time[0]:.2f} to {time[-1]:.2f} s but the trajectory {trajectory.time[0]:.2f} to {trajectory.time[-1]:.2f} s: no frame lies inside it",
+            "frames and IMU must share the campaign's one clock",
+        )
+    course, speed = mean_course(trajectory, float(time[inside][0]), float(time[inside][-1]))
+    points = target_points(targets, course)
+    distance = np.linalg.norm(points[:, Tracks.CENTRE] - np.nanmean(poses.centre, axis=0), axis=-1)
+    if (distance > settings.farthest_target_m).any():
+        i = int(np.argmax(distance))
+        raise InputError(
+            "targets", f"target {targets.ids[i]}", f"lies {distance[i] / 1000:.0f} km from the line", "latitude and longitude may be swapped: correct them",
+        )
+    row, col = project(points, poses, camera)
+    nominal = nominal_track(row, col, time, camera, speed, float(np.nanmean(distance_down(points, poses))))
+    tracks = Tracks(("nominal", "tracking"), targets.ids, np.stack([nominal[0], row]), np.stack([nominal[1], col]))
+    return TrackingResult(tracks, poses, course, speed, float(np.nanmean(distance_down(points, poses))))
+
+
+def camera_poses(trajectory: Trajectory, time: Array, mounting: Mounting) -> CameraPoses:
+    """The camera at times (n,) [s]; NaN where the trajectory does not reach."""
+    inside = (time >= trajectory.time[0]) & (time <= trajectory.time[-1])
+    centre, dcm = np.full((time.size, 3), np.nan), np.full((time.size, 3, 3), np.nan)
+    if inside.sum() >= 1:
+        part = trajectory.between(time[inside].min() - MARGIN_S, time[inside].max() + MARGIN_S)
+        attitude = Attitude.fit(part.time, rpy_to_dcm(*part.rpy.T))
+        north, east = radii_of_curvature(part.latitude)
+        rates = (
+            part.velocity[:, 0] / (north + part.height),
+            part.velocity[:, 1] / ((east + part.height) * np.cos(part.latitude)),
+            -part.velocity[:, 2],
+        )
+        position = [
+            CubicHermiteSpline(part.time, v, r)(time[inside])
+            for v, r in zip((part.latitude, part.longitude, part.height), rates, strict=True)
+        ]
+        centre[inside], dcm[inside] = camera_pose(*position, attitude(time[inside]), mounting)
+    return CameraPoses(time, centre, dcm)
+
+
+def mean_course(trajectory: Trajectory, start: float, stop: float) -> tuple[float, float]:
+    """Course [rad, from north over east] and ground speed [m/s] of the mean velocity between two times."""
+    part = trajectory.between(start, stop)
+    north, east = part.velocity[:, 0].mean(), part.velocity[:, 1].mean()
+    return float(np.arctan2(east, north)), float(np.hypot(north, east))
+
+
+def target_points(targets: Targets, course: float) -> Array:
+    """ECEF points (target, 25, 3): a 5 × 5 grid along and across the course, within ±size/4, flat at the target's height."""
+    along, across = (g.ravel() for g in np.meshgrid(*[np.linspace(-0.25, 0.25, Tracks.GRID)] * 2, indexing="ij"))
+    north = along * np.cos(course) - across * np.sin(course)
+    east = along * np.sin(course) + across * np.cos(course)
+    offset = np.stack([north, east, np.zeros_like(north)], -1) * targets.size[:, None, None]
+    centre = geodetic_to_ecef(targets.latitude, targets.longitude, targets.height)
+    frame = ned_to_ecef_dcm(targets.latitude, targets.longitude)
+    return centre[:, None, :] + np.einsum("tij,tpj->tpi", frame, offset)
+
+
+def project(points: Array, poses: CameraPoses, camera: Camera) -> tuple[Array, Array]:
+    """Row and column (target, point, frame) of ECEF points (target, point, 3), also where they fall off the detector."""
+    line_of_sight = points[:, :, None, :] - poses.centre
+    return camera.project(np.einsum("fij,tpfi->tpfj", poses.dcm, line_of_sight))
+
+
+def distance_down(points: Array, poses: CameraPoses) -> Array:
+    """Height of the camera above each target's centre (target, frame) [m]."""
+    _, _, camera_height = ecef_to_geodetic(poses.centre)
+    _, _, height = ecef_to_geodetic(points[:, Tracks.CENTRE])
+    return camera_height - height[:, None]
+
+
+def nominal_track(row: Array, col: Array, time: Array, camera: Camera, speed: float, height: float) -> tuple[Array, Array]:
+    """Uniform straight motion from the anchor frame: col += v·Δt·f/(p·H) a frame, row unchanged; no attitude."""
+    anchor = camera.central_frame(row[:, Tracks.CENTRE], col[:, Tracks.CENTRE])
+    pixels = speed * camera.focal_length / (camera.pixel_pitch * height) * (time - time[anchor][:, None])
+    pick = anchor[:, None, None]
+    row0, col0 = np.take_along_axis(row, pick, 2), np.take_along_axis(col, pick, 2)
+    return np.broadcast_to(row0, row.shape).copy(), col0 + pixels[:, None, :]

@@ -1,0 +1,406 @@
+"""The thermal stage: its arithmetic against independent oracles, its model against held-out profiles, its guards."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.stats import multivariate_normal
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
+from sklearn.linear_model import BayesianRidge
+
+from pipeline.datasets import write_dataset
+from pipeline.errors import InputError
+from pipeline.records import Chamber, StaticAttitude, Temperatures
+from stages.thermal import ThermalModel, ThermalResult, ThermalSettings, run
+from stages.thermal.baselines import fit_polynomial, fit_traditional_rbf, folds
+from stages.thermal.evidence import log_evidence, posterior, reestimate
+from stages.thermal.features import channel_features, smoothed
+from stages.thermal.network import fit_network
+from stages.thermal.targets import bias_samples, block_means, expected_reading, thinned
+
+Array = NDArray[np.float64]
+
+DEG_PER_H = np.deg2rad(1.0) / 3600.0
+MICRO_G = 9.80665e-6
+GYRO_NOISE, ACCEL_NOISE = 0.006 * DEG_PER_H, 1.2 * MICRO_G      # of 100 s means
+TRAIN = [(0, 20), (90, 20), (100, 50), (220, 50), (246.7, -30), (366, -30)]
+VERIFY = [(0, 20), (60, 20), (110, -30), (170, -30), (200, 30), (260, 30), (280, -30), (340, -30)]
+
+
+# ----------------------------------------------------------------------------------------- a chamber of the test's own
+
+
+def lagged(signal: Array, dt: float, tau: float) -> Array:
+    """First-order lag, started settled."""
+    out, state = np.empty_like(signal), signal[0]
+    keep = np.exp(-dt / tau)
+    for i, value in enumerate(signal):
+        state = value + (state - value) * keep
+        out[i] = state
+    return out
+
+
+def chamber(profile: list[tuple[float, float]], seed: int, dt: float = 2.0) -> tuple[Chamber, Array]:
+    """A static run through (minute, °C) corners, and the true bias (n, 6): smooth in T, Ṫ and the gradients."""
+    rng = np.random.default_rng(seed)
+    minutes, degrees = np.array(profile).T
+    time = np.arange(0.0, minutes[-1] * 60.0, dt)
+    oven = np.interp(time, minutes * 60.0, degrees)
+    thermometers = np.stack([lagged(oven, dt, tau) for tau in (700.0, 620.0, 250.0)], axis=1)
+    accel_t = lagged(oven, dt, 400.0)
+    t, a = thermometers.mean(axis=1), (thermometers[:, 0] - thermometers[:, 2]) / 10.0
+    rate, accel_rate = np.gradient(t, dt) / 0.04, np.gradient(accel_t, dt) / 0.04
+    x, z = (t - 10.0) / 30.0, (accel_t - 10.0) / 30.0
+    gyro = [0.02 * x**2 + 0.01 * rate, 0.015 * np.sin(2 * x) - 0.01 * a, 0.02 * x + 0.006 * x * rate]
+    accel = [150 * z + 40 * z**2, 120 * np.sin(1.5 * z) + 30 * accel_rate, -200 * z + 30 * z**3 - 20 * accel_rate]
+    bias = np.column_stack([g * DEG_PER_H for g in gyro] + [f * MICRO_G for f in accel])
+    noise = rng.standard_normal(bias.shape) * np.repeat([GYRO_NOISE, ACCEL_NOISE], 3) * np.sqrt(100.0 / dt)
+    stood = Chamber(
+        "own", time, np.zeros((len(time), 3)), np.zeros((len(time), 3)),
+        Temperatures(
+            time, np.repeat(thermometers[:, None], 3, axis=1) + 0.02 * rng.standard_normal((len(time), 3, 3)),
+            np.repeat(accel_t[:, None], 3, axis=1) + 0.02 * rng.standard_normal((len(time), 3)),
+        ),
+        StaticAttitude(np.deg2rad(40.0), 30.0, 0.01, -0.02, 0.6), None,
+    )
+    reading = expected_reading(stood) + bias + noise
+    return replace(stood, gyro=reading[:, :3], accel=reading[:, 3:]), bias
+
+
+@pytest.fixture(scope="module")
+def train() -> Chamber:
+    return chamber(TRAIN, 1)[0]
+
+
+@pytest.fixture(scope="module")
+def result(train: Chamber) -> ThermalResult:
+    return run([train], [chamber(VERIFY, 2)[0]], ThermalSettings())
+
+
+# -------------------------------------------------------------------------------------------------- evidence framework
+
+
+def problem(seed: int = 3, count: int = 150, units: int = 20) -> tuple[Array, Array]:
+    rng = np.random.default_rng(seed)
+    design = rng.standard_normal((count, units)) * np.logspace(0, -2, units)
+    return design, design @ rng.standard_normal(units) + 0.1 * rng.standard_normal(count)
+
+
+def test_evidence_equals_bayesian_ridge() -> None:
+    """scikit-learn's α is 2β (a noise precision), its λ is 2α (a weight precision); same fixed point, same model."""
+    design, target = problem()
+    oracle = BayesianRidge(
+        alpha_1=0, alpha_2=0, lambda_1=0, lambda_2=0, fit_intercept=False, tol=1e-14, max_iter=20000
+    ).fit(design, target)
+    ours = reestimate(torch.tensor(design), torch.tensor(target), 1.0, 1.0, tolerance=1e-13)
+    np.testing.assert_allclose([2 * ours.beta, 2 * ours.alpha], [oracle.alpha_, oracle.lambda_], rtol=1e-6)
+    np.testing.assert_allclose(ours.weights.numpy(), oracle.coef_, rtol=1e-6, atol=1e-9)
+    eigenvalues = np.linalg.eigvalsh(design.T @ design)
+    gamma = (oracle.alpha_ * eigenvalues / (oracle.lambda_ + oracle.alpha_ * eigenvalues)).sum()
+    assert ours.gamma == pytest.approx(gamma, rel=1e-6)
+    new = np.random.default_rng(4).standard_normal((7, design.shape[1]))
+    deviation = np.sqrt(((new @ ours.factor.numpy()) ** 2).sum(axis=1) + 0.5 / ours.beta)
+    np.testing.assert_allclose(deviation, oracle.predict(new, return_std=True)[1], rtol=1e-6)
+
+
+def test_means_and_sums_give_the_same_model() -> None:
+    """With E_w, E_d as means, H = (2α/M)I + (2β/N)ΦᵀΦ and γ = M − (2α/M)·tr H⁻¹: α and β grow by M and N, no more."""
+    design, target = problem()
+    count, units = design.shape
+    alpha, beta = 1.0, 1.0
+    for _ in range(2000):
+        hessian = 2 * alpha / units * np.eye(units) + 2 * beta / count * design.T @ design
+        weights = np.linalg.solve(hessian, 2 * beta / count * design.T @ target)
+        gamma = units - 2 * alpha / units * np.trace(np.linalg.inv(hessian))
+        alpha = gamma / (2 * (weights**2).mean())
+        beta = (count - gamma) / (2 * ((target - design @ weights) ** 2).mean())
+    sums = reestimate(torch.tensor(design), torch.tensor(target), 1.0, 1.0)
+    np.testing.assert_allclose([alpha / units, beta / count, gamma], [sums.alpha, sums.beta, sums.gamma], rtol=1e-6)
+    np.testing.assert_allclose(weights, sums.weights.numpy(), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [8, 40])
+@pytest.mark.parametrize("alpha", [1e-6, 1.0, 1e6])
+def test_gamma_is_bounded(count: int, alpha: float) -> None:
+    """0 ≤ γ ≤ M, also with more weights than data; it goes to its ends as the regularisation does."""
+    design, target = problem(count=count)
+    gamma = posterior(torch.tensor(design), torch.tensor(target), alpha, 1.0).gamma
+    assert 0.0 <= gamma <= min(count, design.shape[1]) * (1 + 1e-6)
+    if alpha == 1e6:
+        assert gamma < 0.01
+
+
+def test_log_evidence_is_the_density_of_the_target() -> None:
+    """ln N(y; 0, ΦΦᵀ/(2α) + I/(2β)), stationary in α and β at MacKay's fixed point."""
+    design, target = problem(count=30, units=6)
+    alpha, beta = 0.7, 20.0
+    log_alpha, log_beta = (torch.tensor(np.log(v), requires_grad=True) for v in (alpha, beta))
+    covariance = design @ design.T / (2 * alpha) + np.eye(30) / (2 * beta)
+    ours = float(log_evidence(torch.tensor(design), torch.tensor(target), log_alpha, log_beta).detach())
+    assert ours == pytest.approx(multivariate_normal(np.zeros(30), covariance).logpdf(target), rel=1e-9)
+    fixed = reestimate(torch.tensor(design), torch.tensor(target), 1.0, 1.0)
+    with torch.no_grad():
+        log_alpha.fill_(np.log(fixed.alpha))
+        log_beta.fill_(np.log(fixed.beta))
+    log_evidence(torch.tensor(design), torch.tensor(target), log_alpha, log_beta).backward()
+    assert log_alpha.grad is not None and log_beta.grad is not None
+    assert max(abs(float(log_alpha.grad)), abs(float(log_beta.grad))) < 1e-6
+
+
+def test_network_with_a_centre_at_every_datum_is_a_gaussian_process() -> None:
+    """Same mean and standard deviation as scikit-learn's, inside and (Gaussian units faded) just outside the data."""
+    rng = np.random.default_rng(5)
+    x = rng.uniform(-1.5, 1.5, (60, 2))
+    y = 3.0 + np.sin(2 * x[:, 0]) + 0.5 * x[:, 1] + 0.05 * rng.standard_normal(60)
+    net = fit_network(x, y, centres=60, start_widths=((1.0, 1.0),))
+    amplitude = 0.5 / net.alpha
+    kernel = ConstantKernel(amplitude) * RBF(net.widths) + ConstantKernel(amplitude * net.ratio**2) * DotProduct(0.0)
+    oracle = GaussianProcessRegressor(kernel, alpha=0.5 / net.beta, optimizer=None)
+    with np.errstate(divide="ignore"):
+        oracle.fit(x, (y - net.constant) / net.scale)
+    at = rng.uniform(-2.0, 2.0, (200, 2))
+    mean, sigma = net.predict(at)
+    mean_gp, sigma_gp = oracle.predict(at, return_std=True)
+    np.testing.assert_allclose(mean, net.constant + net.scale * mean_gp, atol=1e-4 * net.scale)
+    # The network's constant is known to σ/√N only, which the process does not count.
+    sigma = np.sqrt(sigma**2 - net.noise_sigma**2 / net.count)
+    np.testing.assert_allclose(sigma, net.scale * sigma_gp, rtol=1e-2)
+
+
+# ------------------------------------------------------------------------------------------------ targets and features
+
+
+def test_an_ideal_imu_has_no_bias() -> None:
+    own, _ = chamber(TRAIN[:2], 1)
+    ideal = replace(own, gyro=np.tile(expected_reading(own)[:3], (len(own.time), 1)),
+                    accel=np.tile(expected_reading(own)[3:], (len(own.time), 1)))
+    assert np.abs(bias_samples(ideal)).max() < 1e-15
+    level = replace(own, attitude=StaticAttitude(np.deg2rad(40.0), 0.0, 0.0, 0.0, 0.0))
+    np.testing.assert_allclose(expected_reading(level)[3:], [0.0, 0.0, -9.80169], atol=1e-4)
+    np.testing.assert_allclose(expected_reading(level)[:3] / 7.292115e-5, [0.766044, 0.0, -0.642788], atol=1e-6)
+
+
+def test_without_attitude_the_mean_is_the_reference(train: Chamber) -> None:
+    assert np.abs(bias_samples(replace(train, attitude=None)).mean(axis=0)).max() < 1e-12
+    notes = run([replace(train, attitude=None)], [], ThermalSettings(centres=10, start_widths=((2.0, 2.0),))).notes
+    assert any("no attitude" in note for note in notes)
+
+
+def test_blocks_are_of_time_and_full() -> None:
+    time = np.delete(np.arange(0.0, 45.0), slice(10, 15))
+    np.testing.assert_allclose(block_means(time, time[:, None], 10.0)[:, 0], [4.5, 24.5, 34.5])
+
+
+@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("step", [0.01, 1.0, 7.0])
+def test_features_are_the_same_at_any_sampling(step: float, causal: bool) -> None:
+    """A ramp is followed without lag, up to its ends; a smooth curve alike at any rate."""
+    time = np.arange(0.0, 1200.0, step)
+    value, rate = smoothed(time, (20.0 + 0.05 * time)[:, None], time, 30.0, causal)
+    late = time > (250.0 if causal else -1.0)
+    np.testing.assert_allclose(value[late, 0], 20.0 + 0.05 * time[late], atol=1e-6)
+    np.testing.assert_allclose(rate[late, 0], 0.05, atol=1e-8)
+    curve, at = np.sin(2 * np.pi * time / 1500.0), np.array([300.0, 700.0])
+    dense = np.arange(0.0, 1200.0, 0.5)
+    expected = smoothed(dense, np.sin(2 * np.pi * dense / 1500.0)[:, None], at, 30.0, causal)
+    for ours, theirs in zip(smoothed(time, curve[:, None], at, 30.0, causal), expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=4e-3 if step > 1.5 else 1e-4)
+
+
+def test_causal_features_ignore_the_future() -> None:
+    time = np.arange(0.0, 600.0)
+    changed = np.where(time > 400.0, 50.0, 20.0)[:, None]
+    at = np.array([395.0])
+    constant = smoothed(time, np.full((600, 1), 20.0), at, 30.0, True)
+    for ours, theirs in zip(smoothed(time, changed, at, 30.0, True), constant, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-9)
+    assert smoothed(time, changed, at, 30.0)[1][0, 0] > 0.1
+
+
+def test_causal_features_start_quietly() -> None:
+    """The first slopes, all noise, stay near zero."""
+    time = np.arange(0.0, 300.0)
+    noisy = (20.0 + 0.02 * np.random.default_rng(7).standard_normal(300))[:, None]
+    assert np.abs(smoothed(time, noisy, time, 30.0, True)[1]).max() < 2e-3
+
+
+def test_one_thermometer_means_no_gradients(train: Chamber) -> None:
+    one = replace(train.temperatures, gyro=train.temperatures.gyro[:, :, :1])
+    assert [f.shape[1] for f in channel_features(one, train.time[:5], 30.0)] == [2] * 6
+    # The reader repeats a single thermometer three times: its gradients then do not vary and are not used.
+    three = replace(one, gyro=np.repeat(one.gyro, 3, axis=2))
+    fast = ThermalSettings(centres=10, start_widths=((2.0, 2.0),))
+    models = [run([replace(train, temperatures=t)], [], fast).model for t in (one, three)]
+    ours, theirs = (model.correction(t).gyro for model, t in zip(models, (one, three), strict=True))
+    np.testing.assert_allclose(ours, theirs, atol=1e-6 * np.ptp(ours))
+
+
+def test_fast_runs_are_thinned_to_the_same_blocks() -> None:
+    own, _ = chamber(TRAIN[:2], 1, dt=0.5)
+    thin = thinned(own, 60.0, 1.5)
+    assert len(thin.time) == len(own.time) // 3
+    means = [block_means(c.time, np.hstack([c.gyro, c.temperatures.accel]), 60.0) for c in (thin, own)]
+    np.testing.assert_allclose(means[0], means[1], rtol=1e-9)
+
+
+# ----------------------------------------------------------------------------------------------------------- the model
+
+
+def test_held_out_profile_reaches_the_noise_floor(result: ThermalResult) -> None:
+    """Median over axes within 1.15 of the floor, none above 1.35; better than the baselines; 95 % intervals cover."""
+    gyro = {k: np.array(v) / 0.006 for k, v in result.verification["gyro_std_deg_per_h"].items()}
+    accel = {k: np.array(v) / 1.2 for k, v in result.verification["accel_std_ug"].items()}
+    for figures in (gyro, accel):
+        assert list(figures) == ["raw", "polynomial", "rbf", "bayesian_rbf"]
+        assert np.median(figures["bayesian_rbf"]) <= 1.15
+        assert figures["bayesian_rbf"].max() <= 1.35
+        for worse in ("raw", "polynomial", "rbf"):
+            assert figures["bayesian_rbf"].mean() < figures[worse].mean()
+    held_out = result.figures["verify"][0]
+    covered = np.abs(held_out["left"]["bayesian_rbf"]) < 1.96 * held_out["sigma"]
+    assert 0.91 <= covered.mean() <= 0.985
+
+
+def test_training_table_states_the_evidence(result: ThermalResult) -> None:
+    table = result.figures["training"]
+    assert [row["channel"] for row in table] == [f"{s}_{a}" for s in ("gyro", "accel") for a in "xyz"]
+    assert all(0.0 < row["gamma"] < row["m"] and row["n"] == 366 for row in table)
+    noise = np.array([row["noise_sigma"] for row in table]) / np.repeat([GYRO_NOISE, ACCEL_NOISE], 3)
+    np.testing.assert_allclose(noise, np.sqrt(100.0 / 60.0), rtol=0.15)
+    assert any("N = 366" in note for note in result.notes)
+
+
+def test_model_file_gives_the_same_correction(result: ThermalResult, train: Chamber, tmp_path: Path) -> None:
+    write_dataset(result.model.to_dataset(), tmp_path / "model.nc")
+    again = ThermalModel.from_file(tmp_path / "model.nc")
+    ours, theirs = result.model.correction(train.temperatures), again.correction(train.temperatures)
+    for name in ("time", "gyro", "accel", "sigma_gyro", "sigma_accel", "distance"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    write_dataset(ours.to_dataset(), tmp_path / "correction.nc")
+    with pytest.raises(InputError, match="schema"):
+        ThermalModel.from_file(tmp_path / "correction.nc")
+
+
+def test_same_input_same_bytes(train: Chamber) -> None:
+    fast = ThermalSettings(centres=20, start_widths=((2.0, 2.0),))
+    first, second = (run([train], [], fast).model.correction(train.temperatures) for _ in range(2))
+    assert first.gyro.tobytes() == second.gyro.tobytes()
+    assert first.sigma_accel.tobytes() == second.sigma_accel.tobytes()
+
+
+def test_correction_at_the_readings_or_slower(result: ThermalResult, train: Chamber) -> None:
+    """200 Hz readings do not make 200 Hz corrections; a slow log keeps its own times."""
+    t = train.temperatures
+    fast = np.arange(0.0, 100.0, 0.005)
+    rapid = Temperatures(fast, np.full((len(fast), 3, 3), 20.0), np.full((len(fast), 3), 20.0))
+    assert len(result.model.correction(rapid).time) < 100
+    np.testing.assert_array_equal(result.model.correction(t).time, t.time)
+
+
+def test_outside_the_chamber_sigma_grows_and_the_correction_stays_bounded(result: ThermalResult) -> None:
+    def at(degrees: float) -> tuple[Array, Array, float]:
+        steady = Temperatures(np.arange(100.0), np.full((100, 3, 3), degrees), np.full((100, 3), degrees))
+        c = result.model.correction(steady)
+        return np.r_[c.gyro[50], c.accel[50]], np.r_[c.sigma_gyro[50], c.sigma_accel[50]], float(c.distance[50].max())
+
+    (inside, sigma_in, d_in), (_, sigma_out, d_out), (far, sigma_far, d_far) = at(20.0), at(75.0), at(500.0)
+    assert d_in == 0.0 and 0.0 < d_out < 1.5 < d_far
+    assert (sigma_out > 1.5 * sigma_in).all() and (sigma_far > sigma_out).all()
+    raw = np.r_[result.figures["verify"][0]["raw"].std(axis=0)]
+    assert (np.abs(far) < 10.0 * raw + np.abs(inside)).all()
+    np.testing.assert_allclose(at(1e5)[0], at(1e6)[0])
+
+
+def test_baselines_are_no_straw_men() -> None:
+    """Cross-validation finds a cubic and follows a bump; folds are contiguous stretches."""
+    rng = np.random.default_rng(6)
+    x = np.linspace(-2, 2, 300)[:, None]
+    cubic = fit_polynomial(x, x[:, 0] ** 3 - x[:, 0] + 0.1 * rng.standard_normal(300), (1, 2, 3, 4, 5))
+    assert len(cubic.coefficients) >= 4
+    bump = np.exp(-2 * x[:, 0] ** 2)
+    rbf = fit_traditional_rbf(x, bump + 0.01 * rng.standard_normal(300), (4, 8, 12), (0.5, 1.0), 0)
+    assert np.abs(rbf.predict(x)[0] - bump).max() < 0.02
+    assert (np.diff(folds(300)) != 0).sum() == 14 and set(folds(300)) == set(range(5))
+
+
+# -------------------------------------------------------------------------------------------------------------- guards
+
+
+def test_stuck_thermometer_leaves_the_channel_uncompensated(train: Chamber) -> None:
+    t = train.temperatures
+    gyro, accel = t.gyro.copy(), t.accel.copy()
+    gyro[:, 1, 2], accel[:, 0] = 21.0, 25.0
+    stuck = replace(train, temperatures=replace(t, gyro=gyro, accel=accel))
+    result = run([stuck], [stuck], ThermalSettings(centres=10, start_widths=((2.0, 2.0),)))
+    left_out = [n.split(" is left")[0] for n in result.notes if "uncompensated" in n]
+    assert left_out == ["Channel gyro_y", "Channel accel_x"]
+    assert any("shell thermometer" in n for n in result.notes)
+    correction = result.model.correction(t)
+    assert not correction.gyro[:, 1].any() and correction.gyro[:, 0].any()
+    rms = np.sqrt((block_means(train.time, bias_samples(train), 60.0)[:, 1] ** 2).mean())
+    np.testing.assert_allclose(correction.sigma_gyro[:, 1], rms)
+    left = result.verification["gyro_std_deg_per_h"]
+    assert left["bayesian_rbf"][1] == left["raw"][1]
+
+
+def test_thermometer_stuck_in_flight_leaves_that_channel_alone(result: ThermalResult, train: Chamber) -> None:
+    accel = train.temperatures.accel.copy()
+    accel[:, 2] = 25.0
+    correction = result.model.correction(replace(train.temperatures, accel=accel))
+    assert not correction.accel[:, 2].any() and correction.accel[:, 1].any()
+
+
+def test_constant_temperature_teaches_nothing(train: Chamber) -> None:
+    t = train.temperatures
+    still = replace(train, temperatures=replace(t, gyro=np.full_like(t.gyro, 20.0), accel=np.full_like(t.accel, 20.0)))
+    result = run([still], [], ThermalSettings())
+    assert sum("uncompensated" in n for n in result.notes) == 6
+    assert result.verification == {} and result.figures["training"] == []
+    assert not result.model.correction(t).gyro.any()
+
+
+def test_users_mistakes_are_named(train: Chamber, result: ThermalResult) -> None:
+    with pytest.raises(InputError, match="no chamber run"):
+        run([], [], ThermalSettings())
+    moved = replace(train, gyro=train.gyro + np.where(train.time > 9000, 0.1, 0.0)[:, None])
+    with pytest.raises(InputError, match="moved"):
+        run([moved], [], ThermalSettings())
+    upside_down = replace(train, attitude=replace(train.attitude, roll=np.pi))
+    with pytest.raises(InputError, match="roll_deg"):
+        run([upside_down], [], ThermalSettings())
+    with pytest.raises(InputError, match="block_s"):
+        run([chamber([(0, 20), (10, 40)], 1)[0]], [], ThermalSettings())
+    one = replace(train.temperatures, gyro=train.temperatures.gyro[:, :, :1])
+    with pytest.raises(InputError, match="three thermometers"):
+        result.model.correction(one)
+    with pytest.raises(ValueError, match="smoothing"):
+        ThermalSettings.model_validate({"smoothing": 30})
+
+
+# ---------------------------------------------------------------------------------------------------- shared campaigns
+
+
+def test_shared_campaign_clean_reaches_its_floor() -> None:
+    """Floor: standard deviation of 100 s means of raw minus truth; all gyro and accelerometer axes."""
+    shared = Path(os.environ.get("TSMFTIS_SHARED", Path(__file__).parents[2].parent / "shared"))
+    folder, truth = shared / "campaigns/clean/chamber", shared / "campaigns/clean-truth/thermal.npz"
+    if not (folder.is_dir() and truth.is_file()):
+        pytest.skip(f"{shared}/campaigns/clean is not here: set TSMFTIS_SHARED to the folder that holds campaigns/")
+    train, verify = (Chamber.from_file(folder / f"{name}.nc", name) for name in ("train", "verify"))
+    result = run([train], [verify], ThermalSettings())
+    with np.load(truth) as z:
+        noise = np.hstack([verify.gyro - z["verify_gyro"], verify.accel - z["verify_accel"]])
+    floor = noise[: len(noise) // 100 * 100].reshape(-1, 100, 6).mean(axis=1).std(axis=0)
+    left = np.r_[
+        np.array(result.verification["gyro_std_deg_per_h"]["bayesian_rbf"]) * DEG_PER_H,
+        np.array(result.verification["accel_std_ug"]["bayesian_rbf"]) * MICRO_G,
+    ] / floor
+    assert np.median(left[:3]) <= 1.15 and np.median(left[3:]) <= 1.15
+    assert left.max() <= 1.35
