@@ -126,7 +126,8 @@ def _spectrum(block: Any, path: Path) -> tuple[Array, Array]:
     wavenumber, values = np.asarray(block.x, np.float64) * PER_CM, np.asarray(block.y, np.float64)
     if wavenumber.size != values.size or not np.isfinite(values).all():
         raise InputError(path, "spectrum", "is damaged", "copy the file again")
-    return (wavenumber, values) if wavenumber[0] < wavenumber[-1] else (wavenumber[::-1].copy(), values[::-1].copy())
+    order = np.argsort(wavenumber)
+    return wavenumber[order], values[order]
 
 
 def _code(parameters: Any, key: str, names: dict[str, str]) -> str | None:

@@ -3,7 +3,7 @@
     B(σ) = c·2·Re(S(σ)·exp(−iφ(σ)))  (mertz),   B(σ) = c·2·|S(σ)|  (power),   S(σ) = ∫ w(x)·I(x)·exp(−2πiσx) dx
 
 For each scan alone: the mean comes off, zero path difference (ZPD) is the sample of largest deviation, w is the
-apodization of half-length L = 0.9/resolution about it, φ the phase of the same transform with L = 0.9/(phase
+apodization of half-length L = 0.9/resolution about it, φ the phase of a transform with a narrower one, 0.9/(phase
 resolution) [1]_. The spectra of the scans are averaged. I(x) = ∫ B(σ)·cos(2πσx + φ(σ)) dσ gives back B for c = 1, in
 counts per m-1. Where the short side is shorter than L, a Mertz ramp counts the doubly measured part once.
 
@@ -39,6 +39,8 @@ OPUS_UNIT = 1_579_800.0 / 8.0       # m-1, see above
 WINDOW_REACH = 0.9                  # L·resolution
 TWO_SIDED = 0.9                     # without a resolution, sides that differ less than this are cut to the shorter
 PHASE_SHARE = 1.0 / 8.0             # L of the phase over that of the spectrum where no phase resolution is known
+# Whatever the spectrum's window: one with strong side lobes (boxcar) turns the phase by π where they are negative.
+PHASE_WINDOW = "blackman-harris-3"
 SHORTEST_SIDE = 8                   # samples about ZPD, below which there is no phase to speak of
 BLOCK = 64                          # wavenumbers transformed at once
 ELEMENTS = 2_000_000                # of a table in memory at once
@@ -188,7 +190,7 @@ def choose(bench: Bench, settings: BenchSettings, zpd: Array) -> tuple[Parameter
         notes.append(f"one-sided: Mertz ramp over {ramp:.4g} m")
     phase_half = _half_length(bench.phase_resolution, settings.phase_resolution_per_m, short, "phase_resolution", notes)
     if phase_half is None:
-        phase_half = min(short, PHASE_SHARE * half)
+        phase_half = short if ramp is not None else min(short, PHASE_SHARE * half)
         if correction == "mertz":
             notes.append(f"no phase resolution is given: phase from {phase_half:.4g} m about ZPD")
     return Parameters(apodization, correction, zero_filling, half, phase_half, ramp), notes
@@ -225,7 +227,7 @@ def _half_length(
         raise InputError(
             "bench", f"setting bench.{name}_per_m",
             f"{wanted:g} m-1 needs {half:.4g} m of OPD, the interferogram has {longest:.4g} m",
-            f"use {WINDOW_REACH / longest:.4g} m-1 or more",
+            f"use {WINDOW_REACH / longest:.6g} m-1 or more",
         )
     notes.append(f"the file's {name} of {resolution:g} m-1 needs {half:.4g} m of OPD: cut to {longest:.4g} m")
     return longest
@@ -250,7 +252,7 @@ def corrected(scans: Array, opd: Array, zpd: Array, wavenumber: Array, parameter
     spectrum = transform(scans * window, opd, wavenumber)
     if p.phase_correction == "power":
         return 2.0 * np.abs(spectrum)
-    near = transform(scans * fourier.apodization(p.apodization, x / p.phase_half_length), opd, wavenumber)
+    near = transform(scans * fourier.apodization(PHASE_WINDOW, x / p.phase_half_length), opd, wavenumber)
     return 2.0 * np.real(spectrum * np.exp(-1j * np.angle(near)))
 
 

@@ -65,7 +65,8 @@ def fake(**parameters: Any) -> SimpleNamespace:
     scan[40], scan[41] = 1.0, 0.5
     block = Parameters(y=np.concatenate([scan, scan[::-1]]))
     spectrum = Parameters(x=np.array([30.0, 20.0, 10.0]), y=np.array([3.0, 2.0, 1.0]), params=Parameters(dxu="WN"))
-    given = Parameters(**({"hfl": 50.0, "lfl": 0.0, "gfw": 1, "gbw": 1, "aqm": "DD", "apf": "NBM", "phz": "ML"} | parameters))
+    plain = {"hfl": 50.0, "lfl": 0.0, "gfw": 1, "gbw": 1, "aqm": "DD", "apf": "NBM", "phz": "ML"}
+    given = Parameters(**(plain | parameters))
     keys = ["igsm", "sm"]
     return SimpleNamespace(is_opus=True, data_keys=keys, all_data_keys=keys, igsm=block, sm=spectrum, params=given)
 

@@ -52,9 +52,9 @@ def position_rate(records: np.ndarray, seconds: np.ndarray) -> np.ndarray:
 
 @real_data
 def test_velocity_of_the_aircraft_is_that_of_its_positions() -> None:
-    """The file's stamps are rounded (steps of 5.000, 5.001 and 5.009 ms): 9 µs at 110 m/s are 1 mm, or 0.16 m/s in 5 ms.
+    """The file's stamps are rounded (steps of 5.000, 5.001, 5.009 ms): 9 µs at 110 m/s are 1 mm, or 0.16 m/s in 5 ms.
 
-    Its positions lie on an even clock, and there each difference agrees; with the stamps as they are, those over 0.25 s do.
+    Its positions lie on an even clock, and there each difference agrees; with the stamps as they are, over 0.25 s.
     """
     records = read_sbet(AIRCRAFT)
     step = np.diff(records["time"])
@@ -87,7 +87,8 @@ def test_level_flight_at_constant_velocity() -> None:
     velocity, rpy = np.tile([60.0, 30.0, -1.0], (n, 1)), np.tile([0.1, -0.05, 2.0], (n, 1))
     dcm = rpy_to_dcm(*rpy.T)
     meridian, prime = radii_of_curvature(latitude)
-    transport = np.stack([30.0 / (prime + height), -60.0 / (meridian + height), -30.0 * np.tan(latitude) / (prime + height)], -1)
+    east, north = 30.0 / (prime + height), 60.0 / (meridian + height)
+    transport = np.stack([east, -north, -east * np.tan(latitude)], -1)
     earth = earth_rate_ned(latitude)
     coriolis = np.cross(2 * earth + transport, velocity)
     force = coriolis - np.stack([0 * height, 0 * height, normal_gravity(latitude, height)], -1)

@@ -57,7 +57,7 @@ def test_gaussian_line_is_found_as_it_is(correction: str, phase: float) -> None:
 
 
 def test_lorentzian_line() -> None:
-    """B(σ) = (γ/π)/((σ−σ0)² + γ²): exp(−2πγ|x|)·cos(2πσ0x); its wings fold at the Nyquist wavenumber, (γ/σ_N)·… small."""
+    """B(σ) = (γ/π)/((σ−σ0)² + γ²): exp(−2πγ|x|)·cos(2πσ0x), cut where it has fallen to 5e-4."""
     x, gamma = axis(), 3e3
     result = run(bench(np.exp(-2 * np.pi * gamma * np.abs(x)) * np.cos(2 * np.pi * CENTRE * x), x), DENSITY)
     truth = gamma / np.pi / ((result.wavenumber - CENTRE) ** 2 + gamma**2)
@@ -65,15 +65,19 @@ def test_lorentzian_line() -> None:
     assert np.abs(result.spectrum - truth)[near].max() < 2e-3 * truth.max()
 
 
-def test_one_sided_agrees_with_two_sided() -> None:
+@pytest.mark.parametrize(("phase", "tolerance"), [(0.1, 1e-3), (0.4, 2e-2)])
+def test_one_sided_agrees_with_two_sided(phase: float, tolerance: float) -> None:
+    """With φ = 0.4 the largest deviation is a fringe off the burst's centre: the slope of the phase's window there turns
+    φ a little, which a one-sided scan feels to first order."""
     both, one = axis(), axis(short=60e-6)
     settings = DENSITY.model_copy(update={"apodization": "connes", "resolution_per_m": 0.9 / 390e-6})
-    a, b = (run(bench(gaussian(x, 0.4), x), settings) for x in (both, one))
+    a, b = (run(bench(gaussian(x, phase), x), settings) for x in (both, one))
     assert a.parameters.ramp is None and b.parameters.ramp == pytest.approx(60e-6, rel=0.02)
     assert any("one-sided" in note for note in b.notes)
-    assert np.linalg.norm(a.spectrum - b.spectrum) < 3e-3 * np.linalg.norm(a.spectrum)
-    mirrored = run(bench(gaussian(-one[::-1], 0.4)[::1], -one[::-1]), settings)     # the long side is the negative one
-    assert np.linalg.norm(a.spectrum - mirrored.spectrum) < 3e-3 * np.linalg.norm(a.spectrum)
+    assert np.linalg.norm(a.spectrum - b.spectrum) < tolerance * np.linalg.norm(a.spectrum)
+    other = -one[::-1]                                                     # the long side is the negative one
+    mirrored = run(bench(gaussian(other, -phase), other), settings)
+    assert np.linalg.norm(a.spectrum - mirrored.spectrum) < tolerance * np.linalg.norm(a.spectrum)
 
 
 def test_power_of_a_one_sided_scan_is_cut_to_its_short_side() -> None:
@@ -92,11 +96,11 @@ def test_each_scan_has_its_own_zpd() -> None:
 
 
 def test_uneven_opd() -> None:
-    rng = np.random.default_rng(1)
+    """A drive whose speed swings by 6 %: the transform takes each sample where it is."""
     x = axis()
-    x = x + np.where(x == 0.0, 0.0, 0.2 * STEP * rng.uniform(-1, 1, x.size))
+    x = x + 3e-6 * np.sin(2.0 * np.pi * x / 300e-6)
     result = run(bench(gaussian(x), x), DENSITY)
-    assert error(result, gaussian_line(result.wavenumber)) < 0.03       # the trapezoid rule on jittered samples
+    assert error(result, gaussian_line(result.wavenumber)) < 2e-3
     assert result.wavenumber[-1] < 0.5 / STEP
 
 
