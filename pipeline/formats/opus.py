@@ -121,7 +121,8 @@ def _spectrum(block: Any, path: Path) -> tuple[Array, Array]:
     """Wavenumber [m-1], increasing, and the vendor's spectrum."""
     if str(getattr(block.params, "dxu", "WN")) != "WN":
         raise InputError(
-            path, "spectrum", f"is against '{block.params.dxu}', not wavenumber", "have OPUS store it against wavenumber"
+            path, "spectrum", f"is against '{block.params.dxu}', not wavenumber",
+            "have OPUS store it against wavenumber",
         )
     wavenumber, values = np.asarray(block.x, np.float64) * PER_CM, np.asarray(block.y, np.float64)
     if wavenumber.size != values.size or not np.isfinite(values).all():

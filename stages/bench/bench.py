@@ -218,7 +218,7 @@ def _half_length(
         return None
     if not resolution > 0.0:
         raise InputError(
-            "bench", f"attribute '{name}_m-1'", f"is {resolution:g}", f"it must be positive: override bench.{name}_per_m"
+            "bench", f"attribute '{name}_m-1'", f"is {resolution:g}", f"must be positive: override bench.{name}_per_m"
         )
     half = WINDOW_REACH / resolution
     if half <= longest * (1.0 + 1e-9):
@@ -227,7 +227,7 @@ def _half_length(
         raise InputError(
             "bench", f"setting bench.{name}_per_m",
             f"{wanted:g} m-1 needs {half:.4g} m of OPD, the interferogram has {longest:.4g} m",
-            f"use {WINDOW_REACH / longest:.6g} m-1 or more",
+            f"use {1.00001 * WINDOW_REACH / longest:.6g} m-1 or more",
         )
     notes.append(f"the file's {name} of {resolution:g} m-1 needs {half:.4g} m of OPD: cut to {longest:.4g} m")
     return longest

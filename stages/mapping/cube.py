@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 Heights = Callable[[Array, Array], Array]
 
 LEAST_SEEN = 0.97           # of the columns, for a cell to have a spectrum: the score's own rule
+EDGE_CELLS = 12             # kept beyond the ends of what the plane says is seen
 MOST_CELLS = 200_000_000    # a grid larger than this means poses that are wrong
 
 
@@ -65,9 +66,11 @@ class MapGrid:
 
 
 def line_grid(poses: CameraPoses, camera: Camera, ground_height: float, settings: MappingSettings) -> MapGrid:
-    """The grid that holds what the detector's corners see on the plane at `ground_height` [m].
+    """The grid that holds what passes over all columns, on the plane at `ground_height` [m].
 
-    Raises StageError where the footprint is no sensible area (camera below the ground, looking at the horizon).
+    Along the track it runs from where the detector's leading edge first falls to where its trailing edge last falls: a cell
+    before or behind is not seen by all columns. A line too short for any such cell is mapped over its whole footprint.
+    Raises StageError where that is no sensible area (camera below the ground, looking at the horizon).
     """
     seen = np.isfinite(poses.centre[:, 0])
     centre, dcm = poses.centre[seen], poses.dcm[seen]
@@ -84,8 +87,13 @@ def line_grid(poses: CameraPoses, camera: Camera, ground_height: float, settings
     cell = settings.cell_m or camera.ground_sample(float(height.mean()) - ground_height)
     along = x * np.sin(course) + y * np.cos(course)
     across = x * np.cos(course) - y * np.sin(course)
-    low = along.min(), across.min()
-    shape = int(np.ceil((along.max() - low[0]) / cell)), int(np.ceil((across.max() - low[1]) / cell))
+    # Columns 0 and last are the two edges; jitter and terrain may carry either a little farther than the plane says.
+    edges = np.stack([along[:, cols == 0.0].mean(axis=1), along[:, cols > 0.0].mean(axis=1)])
+    first, last = edges.max(axis=0).min() - EDGE_CELLS * cell, edges.min(axis=0).max() + EDGE_CELLS * cell
+    if last - first < cell:
+        first, last = along.min(), along.max()
+    low = first, across.min()
+    shape = int(np.ceil((last - first) / cell)), int(np.ceil((across.max() - low[1]) / cell))
     if not 0 < shape[0] * shape[1] < MOST_CELLS:
         raise StageError(f"the line's footprint would need {shape[0]} × {shape[1]} cells: the attitude is not that of a camera looking down")
     origin = (

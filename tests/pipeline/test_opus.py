@@ -82,7 +82,7 @@ def test_backward_scan_is_turned_and_units_are_per_metre(monkeypatch: pytest.Mon
     assert (bench.apodization, bench.resolution, bench.phase_resolution) == ("norton-beer-medium", 400.0, 6400.0)
 
 
-def test_counts_of_scans_decide_over_the_mode_and_parameters_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_counts_of_scans_decide_and_parameters_may_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opus, "_open", lambda path: fake(gbw=0))
     bench = read_opus(Path("x.0"))
     assert bench.interferogram.shape == (1, 200)
@@ -92,7 +92,7 @@ def test_counts_of_scans_decide_over_the_mode_and_parameters_may_be_missing(monk
 @pytest.mark.parametrize(
     ("parameters", "place"), [({"hfl": None}, "HFL"), ({"lfl": 100.0}, "LFL"), ({"hfl": "x"}, "HFL")]
 )
-def test_parameters_that_cannot_be_used(parameters: dict[str, Any], place: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parameters_of_no_use(parameters: dict[str, Any], place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opus, "_open", lambda path: fake(**parameters))
     with pytest.raises(InputError, match=place):
         read_opus(Path("x.0"))
@@ -102,11 +102,14 @@ def test_no_interferogram(monkeypatch: pytest.MonkeyPatch) -> None:
     with_reference = fake()
     with_reference.rf_params = with_reference.params
     monkeypatch.setattr(opus, "_open", lambda path: with_reference)
-    with pytest.raises(InputError, match="no reference interferogram \\(the file holds igsm, sm\\)"):
+    with pytest.raises(InputError, match=r"no reference interferogram \(the file holds igsm, sm\)"):
         read_opus(Path("x.0"), "reference")
 
 
-@pytest.mark.parametrize("content", [b"", b"id,latitude_deg\n", b"\n\n\xfe\xfe", b"\n\n\xfe\xfe" + bytes(range(256)) * 4])
+MAGIC = b"\n\n\xfe\xfe"
+
+
+@pytest.mark.parametrize("content", [b"", b"id,latitude_deg\n", MAGIC, MAGIC + bytes(range(256)) * 4])
 def test_no_opus_file(content: bytes, tmp_path: Path) -> None:
     pytest.importorskip("brukeropus")
     path = tmp_path / "other.0"
@@ -123,7 +126,7 @@ def test_truncated_file(share: float, tmp_path: Path) -> None:
     content = (SHARED / "brukeropus_file.0").read_bytes()
     path = tmp_path / "cut.0"
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(InputError, match="cut.0"):
+    with pytest.raises(InputError, match=r"cut\.0"):
         read_opus(path)
 
 

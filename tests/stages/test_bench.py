@@ -1,4 +1,4 @@
-"""Bench: closed forms of lines, agreement of ways to measure the same, measured files against their vendor's spectra."""
+"""Bench: closed forms of lines, two ways to measure the same, measured files against their vendor's spectra."""
 
 from __future__ import annotations
 
@@ -67,8 +67,8 @@ def test_lorentzian_line() -> None:
 
 @pytest.mark.parametrize(("phase", "tolerance"), [(0.1, 1e-3), (0.4, 2e-2)])
 def test_one_sided_agrees_with_two_sided(phase: float, tolerance: float) -> None:
-    """With φ = 0.4 the largest deviation is a fringe off the burst's centre: the slope of the phase's window there turns
-    φ a little, which a one-sided scan feels to first order."""
+    """With φ = 0.4 the largest deviation is a fringe off the burst's centre: the slope of the phase's window there
+    turns φ a little, which a one-sided scan feels to first order."""
     both, one = axis(), axis(short=60e-6)
     settings = DENSITY.model_copy(update={"apodization": "connes", "resolution_per_m": 0.9 / 390e-6})
     a, b = (run(bench(gaussian(x, phase), x), settings) for x in (both, one))
@@ -206,7 +206,7 @@ def test_vendor_spectrum_is_met(name: str, channel: str) -> None:
 @real_data
 @pytest.mark.parametrize(("channel", "left", "scale"), [("sample", 4.42e-3, 1.0392), ("reference", 1.345e-2, 1.1345)])
 def test_vendor_corrected_nonlinearity_is_missed_as_it_must_be(channel: str, left: float, scale: float) -> None:
-    """NLI = 1: the vendor linearised the MCT's signal, which no Fourier transform does; the brighter channel shows more."""
+    """NLI = 1: the vendor linearised the MCT's signal, which no transform does; the brighter channel shows more."""
     pytest.importorskip("brukeropus")
     result = run(read_opus(SHARED / "opusreader2_629266_1TP_A-1_C1.0", channel), BenchSettings())  # type: ignore[arg-type]
     assert result.relative_rms_scaled == pytest.approx(left, rel=0.02)
