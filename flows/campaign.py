@@ -1,19 +1,22 @@
 """Prefect flows: a line, a flight, a campaign. Tasks are whole stages of a unit and pass plans, never arrays.
 
-`run_campaign` is what the command line calls: one flow a command, on the embedded engine.
+`run_campaign` is what the command line calls: one flow a command, on the embedded engine, in two threads; or on a Dask
+cluster whose machines share the folders.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from flows import engine  # noqa: I001  (must come before prefect: it sets prefect's environment)
+from flows import engine
 
+# isort: split
+# Prefect reads its environment when it is imported, so the engine comes first.
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
-from prefect.futures import PrefectFuture
+from prefect.futures import PrefectFuture, as_completed
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from flows import steps
@@ -22,9 +25,10 @@ from pipeline.errors import InputError, TsmftisError
 from pipeline.run_stage import StageRecord
 
 WORKERS = 2
+LINE_STAGES = ("tracking", "registration", "reconstruction", "mapping", "scoring")
 
-Report = Callable[[StageRecord], None]
-_listeners: list[Report] = []
+Listener = Callable[[StageRecord], None]
+Future = PrefectFuture[StageRecord]
 
 
 @task(name="stage", task_run_name="{stage} {unit}", cache_policy=NO_CACHE, persist_result=False)
@@ -33,97 +37,109 @@ def run_step(plan: Plan, stage: str, unit: str) -> StageRecord:
     step = getattr(steps, f"{stage}_step")
     arguments = () if stage == "thermal" else tuple(unit.split("/"))
     try:
-        record = step(plan, *arguments)
+        record: StageRecord = step(plan, *arguments)
     except InputError:
         raise
     except TsmftisError as error:
-        record = StageRecord(stage, unit, "failed", False, 0.0, "", {}, str(error))
-    for listener in _listeners:
-        listener(record)
+        return StageRecord(stage, unit, "failed", False, 0.0, "", {}, str(error))
     return record
 
 
 @dataclass
 class _Graph:
-    """Submitted tasks in order; a task waits for those before it in its own unit's chain."""
+    """Tasks in the order of submission; a task waits for those before it in its own unit's chain."""
 
     plan: Plan
-    futures: list[PrefectFuture[StageRecord]]
+    futures: list[Future] = field(default_factory=list)
 
-    def submit(self, stage: str, unit: str, after: list[PrefectFuture[StageRecord]]) -> list[PrefectFuture[StageRecord]]:
+    def submit(self, stage: str, unit: str, after: list[Future]) -> list[Future]:
         if not self.plan.does(stage):
             return after
-        future = run_step.submit(self.plan, stage, unit, wait_for=after)
+        future = run_step.submit(plan=self.plan, stage=stage, unit=unit, wait_for=after, return_state=False)
         self.futures.append(future)
         return [future]
 
-    def line(self, flight: str, line: str, after: list[PrefectFuture[StageRecord]]) -> None:
-        for stage in ("tracking", "registration", "reconstruction", "mapping", "scoring"):
+    def line(self, flight: str, line: str, after: list[Future]) -> None:
+        for stage in LINE_STAGES:
             after = self.submit(stage, f"{flight}/{line}", after)
 
-    def flight(self, flight: str, after: list[PrefectFuture[StageRecord]]) -> None:
+    def flight(self, flight: str, after: list[Future]) -> None:
         after = self.submit("navigation", flight, after)
         for line in self.plan.opened.flight(flight).lines:
             if self.plan.wants(flight, line.id):
                 self.line(flight, line.id, after)
 
-    def results(self) -> list[StageRecord]:
-        """Records in the order of submission; the first error of a task is raised after all have ended."""
-        states = [future.state if future.wait() is None else future.state for future in self.futures]
-        return [state.result() for state in states]
+    def results(self, listener: Listener | None) -> list[StageRecord]:
+        """Records in the order of submission. A wrong input is raised after all tasks that do not hang on it have ended."""
+        for future in as_completed(self.futures):
+            ended = future.result(raise_on_failure=False)
+            if listener and isinstance(ended, StageRecord):
+                listener(ended)
+        # Not all at once above: a task that never ran because one before it failed would raise in that one's place.
+        outcomes: list[Any] = [future.result(raise_on_failure=False) for future in self.futures]
+        for outcome in outcomes:
+            if isinstance(outcome, TsmftisError):
+                raise outcome
+        return [future.result() for future in self.futures]
 
 
-@flow(name="line", task_runner=ThreadPoolTaskRunner(max_workers=WORKERS), validate_parameters=False, persist_result=False)
-def line_flow(plan: Plan, flight: str, line: str) -> list[StageRecord]:
+@flow(name="line", validate_parameters=False, persist_result=False)
+def line_flow(plan: Plan, flight: str, line: str, listener: Listener | None = None) -> list[StageRecord]:
     """The stages of one line, on the flight's trajectory as it is."""
-    graph = _Graph(plan, [])
+    graph = _Graph(plan)
     graph.line(flight, line, [])
-    return graph.results()
+    return graph.results(listener)
 
 
-@flow(name="flight", task_runner=ThreadPoolTaskRunner(max_workers=WORKERS), validate_parameters=False, persist_result=False)
-def flight_flow(plan: Plan, flight: str) -> list[StageRecord]:
+@flow(name="flight", validate_parameters=False, persist_result=False)
+def flight_flow(plan: Plan, flight: str, listener: Listener | None = None) -> list[StageRecord]:
     """Navigation and the lines of one flight, on the thermal model as it is."""
-    graph = _Graph(plan, [])
+    graph = _Graph(plan)
     graph.flight(flight, [])
-    return graph.results()
+    return graph.results(listener)
 
 
-@flow(name="campaign", task_runner=ThreadPoolTaskRunner(max_workers=WORKERS), validate_parameters=False, persist_result=False)
-def campaign_flow(plan: Plan) -> list[StageRecord]:
+@flow(name="campaign", validate_parameters=False, persist_result=False)
+def campaign_flow(plan: Plan, listener: Listener | None = None) -> list[StageRecord]:
     """Thermal model, flights, lines and bench interferograms of a campaign."""
-    graph = _Graph(plan, [])
+    graph = _Graph(plan)
     keys = plan.opened.keys
     thermal = graph.submit("thermal", "campaign", []) if keys.thermal is not None else []
     for flight in keys.flights:
-        if any(plan.wants(flight.id, entry.id) for entry in flight.lines) or not plan.lines:
+        if not plan.lines or any(plan.wants(flight.id, entry.id) for entry in flight.lines):
             graph.flight(flight.id, thermal)
     for bench in keys.bench:
         graph.submit("bench", bench.id, [])
-    return graph.results()
+    return graph.results(listener)
 
 
-def run_campaign(plan: Plan, listener: Report | None = None) -> list[StageRecord]:
-    """Run the campaign flow on a quiet embedded engine; `listener` hears of each stage as it ends."""
-    return _run(campaign_flow, listener, plan)
+def run_campaign(plan: Plan, listener: Listener | None = None, dask: str | None = None) -> list[StageRecord]:
+    """Run the campaign flow; `listener` hears of each stage as it ends; `dask`: a scheduler's address, or "local"."""
+    return _run(campaign_flow, dask, plan, listener)
 
 
-def run_flight(plan: Plan, flight: str, listener: Report | None = None) -> list[StageRecord]:
+def run_flight(plan: Plan, flight: str, listener: Listener | None = None) -> list[StageRecord]:
     """Run the flight flow alone."""
-    return _run(flight_flow, listener, plan, flight)
+    return _run(flight_flow, None, plan, flight, listener)
 
 
-def run_line(plan: Plan, flight: str, line: str, listener: Report | None = None) -> list[StageRecord]:
+def run_line(plan: Plan, flight: str, line: str, listener: Listener | None = None) -> list[StageRecord]:
     """Run the line flow alone."""
-    return _run(line_flow, listener, plan, flight, line)
+    return _run(line_flow, None, plan, flight, line, listener)
 
 
-def _run(what: Any, listener: Report | None, *arguments: Any) -> list[StageRecord]:
-    listeners = [listener] if listener else []
-    _listeners.extend(listeners)
+def _run(what: Any, dask: str | None, *arguments: Any) -> list[StageRecord]:
+    runner: Any = ThreadPoolTaskRunner(max_workers=WORKERS) if dask is None else _dask_runner(dask)
+    with engine.quiet_engine():
+        records: list[StageRecord] = what.with_options(task_runner=runner)(*arguments)
+    return records
+
+
+def _dask_runner(address: str) -> Any:
     try:
-        with engine.quiet_engine():
-            return what(*arguments)
-    finally:
-        for one in listeners:
-            _listeners.remove(one)
+        from prefect_dask import DaskTaskRunner
+    except ImportError as error:
+        raise InputError("--dask", "prefect-dask", "is not installed", 'pip install "tsmftis[dask]"') from error
+    if address == "local":
+        return DaskTaskRunner(cluster_kwargs={"n_workers": WORKERS, "threads_per_worker": 1, "dashboard_address": None})
+    return DaskTaskRunner(address=address)

@@ -43,17 +43,27 @@ def assemble(plan: Plan, records: list[StageRecord]) -> dict[str, Any]:
                 continue
             score = summary("scoring", unit) or {"scores": {"rqe": {}, "rqe_area": {}}, "partly_seen": {}}
             lines[line.id] = {
-                "rqe": score["scores"]["rqe"], "rqe_area": score["scores"]["rqe_area"],
-                **{s: summary(s, unit) for s in ("tracking", "registration", "reconstruction", "mapping") if summary(s, unit)},
+                "rqe": score["scores"]["rqe"],
+                "rqe_area": score["scores"]["rqe_area"],
+                **{
+                    s: summary(s, unit)
+                    for s in ("tracking", "registration", "reconstruction", "mapping")
+                    if summary(s, unit)
+                },
             }
             for method, targets in score["partly_seen"].items():
                 partly.setdefault(method, []).extend(f"{unit}/{t}" for t in targets)
         flights[flight.id] = {"navigation": summary("navigation", flight.id), "lines": lines}
     means = campaign_means([line for flight in flights.values() for line in flight["lines"].values()])
     content: dict[str, Any] = {
-        "schema": SCHEMA, "campaign": keys.name, **means, "partly_seen": partly, "flights": flights,
+        "schema": SCHEMA,
+        "campaign": keys.name,
+        **means,
+        "partly_seen": partly,
+        "flights": flights,
         "bench": {b.id: s for b in keys.bench if (s := summary("bench", b.id)) is not None},
-        "stages": stages, "provenance": _provenance(plan),
+        "stages": stages,
+        "provenance": _provenance(plan),
     }
     if (verification := summary("thermal", "campaign")) is not None:
         content["thermal"] = verification
@@ -70,7 +80,11 @@ def _units(plan: Plan) -> dict[str, list[str]]:
     keys = plan.opened.keys
     flights = [f.id for f in keys.flights]
     lines = [f"{f.id}/{line.id}" for f in keys.flights for line in f.lines]
-    special = {"thermal": ["campaign"] if keys.thermal else [], "navigation": flights, "bench": [b.id for b in keys.bench]}
+    special = {
+        "thermal": ["campaign"] if keys.thermal else [],
+        "navigation": flights,
+        "bench": [b.id for b in keys.bench],
+    }
     return {stage: special.get(stage, lines) for stage in STAGES}
 
 
@@ -83,12 +97,16 @@ def _earlier(out: Path) -> dict[tuple[str, str], StageRecord]:
             continue
         stage, _, unit = path.stem.partition("@")
         unit = unit.replace("@", "/")
-        found[stage, unit] = StageRecord(stage, unit, "done", True, content["seconds"], content["key"], content["summary"])
+        found[stage, unit] = StageRecord(
+            stage, unit, "done", True, content["seconds"], content["key"], content["summary"]
+        )
     return found
 
 
 def _provenance(plan: Plan) -> dict[str, Any]:
     return {
-        "tsmftis": __version__, "python": platform.python_version(), "packages": {name: version(name) for name in PACKAGES},
+        "tsmftis": __version__,
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in PACKAGES},
         "settings": plan.settings.model_dump(mode="json"),
     }

@@ -40,7 +40,9 @@ def load_settings(file: Path | None, assignments: list[str]) -> Settings:
         try:
             content = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
         except OSError as error:
-            raise InputError(file, "file", f"cannot be read ({error.strerror})", "give an existing settings file") from error
+            raise InputError(
+                file, "file", f"cannot be read ({error.strerror})", "give an existing settings file"
+            ) from error
         except yaml.YAMLError as error:
             raise InputError(file, "file", "is not valid YAML", "correct the syntax") from error
         if not isinstance(content, dict):
@@ -50,7 +52,9 @@ def load_settings(file: Path | None, assignments: list[str]) -> Settings:
         name, equals, value = assignment.partition("=")
         stage, dot, key = name.partition(".")
         if not (equals and dot and key):
-            raise InputError("--set", f"'{assignment}'", "is not stage.key=value", "write for instance navigation.epoch_s=0.05")
+            raise InputError(
+                "--set", f"'{assignment}'", "is not stage.key=value", "write for instance navigation.epoch_s=0.05"
+            )
         part = content.setdefault(stage.strip(), {})
         if not isinstance(part, dict):
             raise InputError(where, f"key '{stage}'", "holds no keys", "write stage: {key: value}")

@@ -6,8 +6,8 @@ whether it has to run at all. No science here, and no Prefect: `flows.campaign` 
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -42,9 +42,9 @@ class Plan:
     campaign: Path
     out: Path
     settings: Settings = field(default_factory=Settings)
-    start: str | None = None                    # --from: this stage and those after it run again
-    only: str | None = None                     # --only: this stage alone
-    lines: tuple[str, ...] = ()                 # --line: LINE or FLIGHT/LINE; empty: all
+    start: str | None = None  # --from: this stage and those after it run again
+    only: str | None = None  # --only: this stage alone
+    lines: tuple[str, ...] = ()  # --line: LINE or FLIGHT/LINE; empty: all
 
     @cached_property
     def opened(self) -> Campaign:
@@ -92,9 +92,14 @@ def thermal_step(plan: Plan) -> StageRecord:
         return {"verify": result.verification, "notes": list(result.notes)}
 
     return run_stage(
-        plan.out, "thermal", "campaign", "stages.thermal",
+        plan.out,
+        "thermal",
+        "campaign",
+        "stages.thermal",
         {"settings": _plain(plan.settings.thermal), "train": list(keys.train), "verify": list(keys.verify)},
-        {n: campaign.path(n) for n in names}, {"model": "thermal_model.nc", "figures": "thermal_figures.json"}, work,
+        {n: campaign.path(n) for n in names},
+        {"model": "thermal_model.nc", "figures": "thermal_figures.json"},
+        work,
         **plan.switches("thermal"),
     )
 
@@ -105,7 +110,10 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
     entry, instrument = campaign.flight(flight), campaign.instrument
     model = plan.out / "thermal_model.nc"
     inputs = {"imu": campaign.path(entry.imu), "gnss": campaign.path(entry.gnss)}
-    outputs = {n: f"{flight}/{f}" for n, f in (("trajectory", "trajectory.nc"), ("sbet", "trajectory.sbet"), ("figures", "navigation.json"))}
+    outputs = {
+        n: f"{flight}/{f}"
+        for n, f in (("trajectory", "trajectory.nc"), ("sbet", "trajectory.sbet"), ("figures", "navigation.json"))
+    }
     if compensated := campaign.keys.thermal is not None and _has_temperatures(campaign, flight):
         inputs["model"] = _needed(model, "thermal")
         outputs["correction"] = f"{flight}/thermal.nc"
@@ -114,10 +122,16 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         imu = campaign.imu(flight)
         correction = _correction(model, imu) if compensated else None
         assert instrument.imu is not None and instrument.mounting is not None
-        result = navigation.run(
-            imu, campaign.gnss(flight), instrument.imu, instrument.mounting, plan.settings.navigation,
-            initial=_initial(campaign, flight), correction=correction,
-        )
+        with _naming(gnss=inputs["gnss"], imu=inputs["imu"], **{"campaign.yaml": campaign.root / "campaign.yaml"}):
+            result = navigation.run(
+                imu,
+                campaign.gnss(flight),
+                instrument.imu,
+                instrument.mounting,
+                plan.settings.navigation,
+                initial=_initial(campaign, flight),
+                correction=correction,
+            )
         if correction is not None:
             write_dataset(correction.to_dataset(), to["correction"])
         write_dataset(result.trajectory.to_dataset(), to["trajectory"])
@@ -126,13 +140,21 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         return result.quality | {"compensated": compensated}
 
     return run_stage(
-        plan.out, "navigation", flight, "stages.navigation",
+        plan.out,
+        "navigation",
+        flight,
+        "stages.navigation",
         {
-            "settings": _plain(plan.settings.navigation), "imu": _plain(instrument.imu), "initial": _plain(entry.initial),
+            "settings": _plain(plan.settings.navigation),
+            "imu": _plain(instrument.imu),
+            "initial": _plain(entry.initial),
             "antenna": _plain(instrument.mounting.imu_to_antenna if instrument.mounting else None),
             "imu_to_body": _plain(instrument.mounting.imu_to_body if instrument.mounting else None),
         },
-        inputs, outputs, work, **plan.switches("navigation"),
+        inputs,
+        outputs,
+        work,
+        **plan.switches("navigation"),
     )
 
 
@@ -144,19 +166,41 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
 
     def work(to: Paths) -> dict[str, Any]:
         assert instrument.camera is not None and instrument.mounting is not None
-        result = tracking.run(
-            Trajectory.from_file(trajectory), campaign.frames(flight, line).time, campaign.targets(flight, line),
-            instrument.camera, instrument.mounting, plan.settings.tracking,
-        )
+        with _naming(frames=campaign.path(entry.frames), targets=campaign.path(entry.targets)):
+            result = tracking.run(
+                Trajectory.from_file(trajectory),
+                campaign.frames(flight, line).time,
+                campaign.targets(flight, line),
+                instrument.camera,
+                instrument.mounting,
+                plan.settings.tracking,
+            )
         write_dataset(result.tracks.to_dataset(), to["tracks"])
         write_dataset(result.poses.to_dataset(), to["poses"])
-        return {"course_deg": float(np.rad2deg(result.course)) % 360.0, "ground_speed_m_per_s": result.ground_speed, "range_m": result.range}
+        return {
+            "course_deg": float(np.rad2deg(result.course)) % 360.0,
+            "ground_speed_m_per_s": result.ground_speed,
+            "range_m": result.range,
+        }
 
     return run_stage(
-        plan.out, "tracking", f"{flight}/{line}", "stages.tracking",
-        {"settings": _plain(plan.settings.tracking), "camera": _plain(instrument.camera), "mounting": _plain(instrument.mounting)},
-        {"trajectory": _needed(trajectory, "navigation"), "frames": campaign.path(entry.frames), "targets": campaign.path(entry.targets)},
-        {"tracks": f"{flight}/{line}/pos_tracks.nc", "poses": f"{flight}/{line}/poses.nc"}, work, **plan.switches("tracking"),
+        plan.out,
+        "tracking",
+        f"{flight}/{line}",
+        "stages.tracking",
+        {
+            "settings": _plain(plan.settings.tracking),
+            "camera": _plain(instrument.camera),
+            "mounting": _plain(instrument.mounting),
+        },
+        {
+            "trajectory": _needed(trajectory, "navigation"),
+            "frames": campaign.path(entry.frames),
+            "targets": campaign.path(entry.targets),
+        },
+        {"tracks": f"{flight}/{line}/pos_tracks.nc", "poses": f"{flight}/{line}/poses.nc"},
+        work,
+        **plan.switches("tracking"),
     )
 
 
@@ -171,16 +215,24 @@ def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
         tracks = Tracks.from_file(source)
         by_pos = tracks.methods.index("tracking")
         followed = registration.run(
-            campaign.frames(flight, line), Tracks(("tracking",), tracks.targets, tracks.row[[by_pos]], tracks.col[[by_pos]]),
-            camera, plan.settings.registration,
+            campaign.frames(flight, line),
+            Tracks(("tracking",), tracks.targets, tracks.row[[by_pos]], tracks.col[[by_pos]]),
+            camera,
+            plan.settings.registration,
         )
         write_dataset(tracks.joined(followed).to_dataset(), to["tracks"])
         return dict(followed.notes)
 
     return run_stage(
-        plan.out, "registration", f"{flight}/{line}", "stages.registration", {"settings": _plain(plan.settings.registration)},
+        plan.out,
+        "registration",
+        f"{flight}/{line}",
+        "stages.registration",
+        {"settings": _plain(plan.settings.registration)},
         {"tracks": _needed(source, "tracking"), "frames": campaign.path(campaign.line(flight, line).frames)},
-        {"tracks": f"{flight}/{line}/tracks.nc"}, work, **plan.switches("registration"),
+        {"tracks": f"{flight}/{line}/tracks.nc"},
+        work,
+        **plan.switches("registration"),
     )
 
 
@@ -190,8 +242,10 @@ def reconstruction_step(plan: Plan, flight: str, line: str) -> StageRecord:
     entry, instrument = campaign.line(flight, line), campaign.instrument
     folder = plan.out / flight / line
     inputs = {
-        "tracks": _needed(folder / "tracks.nc", "registration"), "frames": campaign.path(entry.frames),
-        "targets": campaign.path(entry.targets), "calibration": campaign.path(campaign.keys.calibration or ""),
+        "tracks": _needed(folder / "tracks.nc", "registration"),
+        "frames": campaign.path(entry.frames),
+        "targets": campaign.path(entry.targets),
+        "calibration": campaign.path(campaign.keys.calibration or ""),
     }
     if campaign.keys.references is not None:
         inputs["references"] = campaign.path(campaign.keys.references)
@@ -199,18 +253,32 @@ def reconstruction_step(plan: Plan, flight: str, line: str) -> StageRecord:
     def work(to: Paths) -> dict[str, Any]:
         assert instrument.camera is not None and instrument.interferometer is not None
         result = reconstruction.run(
-            campaign.frames(flight, line), Tracks.from_file(folder / "tracks.nc"), campaign.targets(flight, line), campaign.calibration(),
+            campaign.frames(flight, line),
+            Tracks.from_file(folder / "tracks.nc"),
+            campaign.targets(flight, line),
+            campaign.calibration(),
             campaign.references() if campaign.keys.references is not None else None,
-            instrument.camera, instrument.interferometer, plan.settings.reconstruction,
+            instrument.camera,
+            instrument.interferometer,
+            plan.settings.reconstruction,
         )
         write_dataset(result.spectra.to_dataset(), to["spectra"])
         write_dataset(result.interferograms.to_dataset(), to["interferograms"])
         return {"phase": result.phase.tolist(), "read_variance_dn2": result.read_variance, "gain_dn": result.gain}
 
     return run_stage(
-        plan.out, "reconstruction", f"{flight}/{line}", "stages.reconstruction",
-        {"settings": _plain(plan.settings.reconstruction), "camera": _plain(instrument.camera), "interferometer": _plain(instrument.interferometer)},
-        inputs, {"spectra": f"{flight}/{line}/spectra.nc", "interferograms": f"{flight}/{line}/interferograms.nc"}, work,
+        plan.out,
+        "reconstruction",
+        f"{flight}/{line}",
+        "stages.reconstruction",
+        {
+            "settings": _plain(plan.settings.reconstruction),
+            "camera": _plain(instrument.camera),
+            "interferometer": _plain(instrument.interferometer),
+        },
+        inputs,
+        {"spectra": f"{flight}/{line}/spectra.nc", "interferograms": f"{flight}/{line}/interferograms.nc"},
+        work,
         **plan.switches("reconstruction"),
     )
 
@@ -222,8 +290,11 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
     folder = plan.out / flight / line
     settings = plan.settings.mapping
     inputs = {
-        "poses": _needed(folder / "poses.nc", "tracking"), "spectra": _needed(folder / "spectra.nc", "reconstruction"),
-        "frames": campaign.path(entry.frames), "calibration": campaign.path(campaign.keys.calibration or ""), "targets": campaign.path(entry.targets),
+        "poses": _needed(folder / "poses.nc", "tracking"),
+        "spectra": _needed(folder / "spectra.nc", "reconstruction"),
+        "frames": campaign.path(entry.frames),
+        "calibration": campaign.path(campaign.keys.calibration or ""),
+        "targets": campaign.path(entry.targets),
     }
     if campaign.keys.dem is not None:
         inputs["dem"] = campaign.path(campaign.keys.dem)
@@ -238,26 +309,51 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
         ground = flat if dem is None else float(dem.height(targets.latitude, targets.longitude).mean())
         grid = mapping.line_grid(poses, camera, ground, settings)
         scored = interferometer.scored_wavenumbers()
-        coefficients = np.array([float(c) for c in str(Spectra.from_file(folder / "spectra.nc").attributes["phase_coefficients"]).split()])
+        coefficients = np.array(
+            [float(c) for c in str(Spectra.from_file(folder / "spectra.nc").attributes["phase_coefficients"]).split()]
+        )
         wavenumber = interferometer.scored_wavenumbers(settings.wavenumber_step_per_m)
         phase = np.interp(wavenumber, scored, smooth_phase(coefficients, scored))
         quicklook = _Quicklook(grid.shape, wavenumber)
         with open_cube(to["cube"], grid.crs, Affine(*grid.affine), grid.shape, 1e9 / wavenumber) as cube:
             for start, strip in mapping.run(
-                campaign.frames(flight, line), poses, heights, grid, wavenumber, phase, campaign.calibration(), camera, interferometer, settings
+                campaign.frames(flight, line),
+                poses,
+                heights,
+                grid,
+                wavenumber,
+                phase,
+                campaign.calibration(),
+                camera,
+                interferometer,
+                settings,
             ):
                 cube.write(np.moveaxis(strip, 2, 0), window=Window(0, start, strip.shape[1], strip.shape[0]))
                 quicklook.add(start, strip)
         quicklook.write(to["quicklook"])
         return {
-            "cells": list(grid.shape), "cell_m": grid.cell, "crs": grid.crs, "bands": wavenumber.size,
-            "seen_fraction": quicklook.seen_fraction, "terrain": "dem" if dem is not None else f"flat at {flat:.1f} m",
+            "cells": list(grid.shape),
+            "cell_m": grid.cell,
+            "crs": grid.crs,
+            "bands": wavenumber.size,
+            "seen_fraction": quicklook.seen_fraction,
+            "terrain": "dem" if dem is not None else f"flat at {flat:.1f} m",
         }
 
     return run_stage(
-        plan.out, "mapping", f"{flight}/{line}", "stages.mapping",
-        {"settings": _plain(settings), "camera": _plain(instrument.camera), "interferometer": _plain(instrument.interferometer)},
-        inputs, {"cube": f"{flight}/{line}/cube.tif", "quicklook": f"{flight}/{line}/quicklook.png"}, work, **plan.switches("mapping"),
+        plan.out,
+        "mapping",
+        f"{flight}/{line}",
+        "stages.mapping",
+        {
+            "settings": _plain(settings),
+            "camera": _plain(instrument.camera),
+            "interferometer": _plain(instrument.interferometer),
+        },
+        inputs,
+        {"cube": f"{flight}/{line}/cube.tif", "quicklook": f"{flight}/{line}/quicklook.png"},
+        work,
+        **plan.switches("mapping"),
     )
 
 
@@ -299,8 +395,15 @@ def scoring_step(plan: Plan, flight: str, line: str) -> StageRecord:
         return content
 
     return run_stage(
-        plan.out, "scoring", f"{flight}/{line}", "stages.scoring", {}, {"spectra": _needed(spectra, "reconstruction")},
-        {"scores": f"{flight}/{line}/scores.json"}, work, **plan.switches("scoring"),
+        plan.out,
+        "scoring",
+        f"{flight}/{line}",
+        "stages.scoring",
+        {},
+        {"spectra": _needed(spectra, "reconstruction")},
+        {"scores": f"{flight}/{line}/scores.json"},
+        work,
+        **plan.switches("scoring"),
     )
 
 
@@ -312,11 +415,23 @@ def bench_step(plan: Plan, bench: str) -> StageRecord:
     def work(to: Paths) -> dict[str, Any]:
         result = bench_stage.run(campaign.bench(bench), plan.settings.bench)
         write_dataset(result.to_dataset(), to["spectrum"])
-        return {"relative_rms": result.relative_rms, "relative_rms_scaled": result.relative_rms_scaled, "scale": result.scale, "notes": list(result.notes)}
+        return {
+            "relative_rms": result.relative_rms,
+            "relative_rms_scaled": result.relative_rms_scaled,
+            "scale": result.scale,
+            "notes": list(result.notes),
+        }
 
     return run_stage(
-        plan.out, "bench", bench, "stages.bench", {"settings": _plain(plan.settings.bench)}, {"interferogram": campaign.path(entry.file)},
-        {"spectrum": f"bench/{bench}.nc"}, work, **plan.switches("bench"),
+        plan.out,
+        "bench",
+        bench,
+        "stages.bench",
+        {"settings": _plain(plan.settings.bench)},
+        {"interferogram": campaign.path(entry.file)},
+        {"spectrum": f"bench/{bench}.nc"},
+        work,
+        **plan.switches("bench"),
     )
 
 
@@ -340,10 +455,18 @@ def _initial(campaign: Campaign, flight: str) -> tuple[float, np.ndarray, np.nda
     if keys is None:
         return None
     return (
-        keys.time_s, np.deg2rad([keys.roll_deg, keys.pitch_deg, keys.yaw_deg]),
+        keys.time_s,
+        np.deg2rad([keys.roll_deg, keys.pitch_deg, keys.yaw_deg]),
         np.deg2rad([keys.sigma_roll_deg, keys.sigma_pitch_deg, keys.sigma_yaw_deg]),
     )
 
 
-def read_json(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
+@contextmanager
+def _naming(**files: Path) -> Iterator[None]:
+    """Stages know records, not files: an InputError about a record is raised again with the file's name."""
+    try:
+        yield
+    except InputError as error:
+        if error.where not in files:
+            raise
+        raise InputError(files[error.where], error.place, error.problem, error.mend) from error

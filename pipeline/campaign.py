@@ -193,7 +193,8 @@ class Campaign:
         if -mean[2] < 0.7 * np.linalg.norm(mean):
             axis = "xyz"[int(np.argmax(np.abs(mean)))]
             raise InputError(
-                path, "variable 'accel'",
+                path,
+                "variable 'accel'",
                 f"gravity acts along body {axis} ({mean[0]:.1f}, {mean[1]:.1f}, {mean[2]:.1f} m s-2 in forward, right, down) "
                 "where an upright aircraft reads about (0, 0, -9.8)",
                 "columns are swapped or signs turned, or mounting.imu_to_body_deg in instrument.yaml is wrong",
@@ -218,7 +219,12 @@ class Campaign:
             known = self.references().names
             for target, name in zip(targets.ids, targets.reference, strict=True):
                 if name and name not in known:
-                    raise InputError(path, f"target {target}, column reference", f"'{name}' is not in {self.keys.references}", f"use one of {', '.join(known)} or leave it empty")
+                    raise InputError(
+                        path,
+                        f"target {target}, column reference",
+                        f"'{name}' is not in {self.keys.references}",
+                        f"use one of {', '.join(known)} or leave it empty",
+                    )
         return targets
 
     def gcps(self, flight: str, line: str) -> records.Gcps | None:
@@ -256,12 +262,16 @@ def read_campaign(folder: Path) -> Campaign:
     for flight in keys.flights:
         _unique([entry.id for entry in flight.lines], where, f"flights[{flight.id}].lines[].id")
     if not (keys.flights or keys.bench or keys.thermal):
-        raise InputError(where, "flights", "there is no flight, no bench file and no chamber run", "name at least one of them")
+        raise InputError(
+            where, "flights", "there is no flight, no bench file and no chamber run", "name at least one of them"
+        )
     has_lines = any(flight.lines for flight in keys.flights)
     if has_lines and keys.calibration is None:
         raise InputError(where, "calibration", "is missing although there are lines", "name the calibration file")
     instrument_path = root / keys.instrument
-    instrument, warnings = _instrument(_validated(InstrumentKeys, instrument_path), instrument_path, bool(keys.flights), has_lines)
+    instrument, warnings = _instrument(
+        _validated(InstrumentKeys, instrument_path), instrument_path, bool(keys.flights), has_lines
+    )
     return Campaign(root, keys, instrument, warnings)
 
 
@@ -287,17 +297,23 @@ def validate(model: type[Any], content: Any, where: Path | str) -> Any:
         first = error.errors()[0]
         place = ".".join(str(p) for p in first["loc"]) or "file"
         if first["type"] == "extra_forbidden":
-            raise InputError(where, f"key '{place}'", "is not known", "remove it or correct its spelling (see the campaign format)") from None
+            raise InputError(
+                where, f"key '{place}'", "is not known", "remove it or correct its spelling (see the campaign format)"
+            ) from None
         if first["type"] == "missing":
             raise InputError(where, f"key '{place}'", "is missing", "add it (see the campaign format)") from None
-        raise InputError(where, f"key '{place}'", f"{first['msg']} (given: {str(first['input'])[:60]!r})", "correct the value") from None
+        raise InputError(
+            where, f"key '{place}'", f"{first['msg']} (given: {str(first['input'])[:60]!r})", "correct the value"
+        ) from None
 
 
 def _named_files(keys: CampaignKeys) -> list[tuple[str, str]]:
     named = [("instrument", keys.instrument)]
     named += [(k, v) for k in ("calibration", "references", "dem") if (v := getattr(keys, k)) is not None]
     if keys.thermal:
-        named += [("thermal.train", n) for n in keys.thermal.train] + [("thermal.verify", n) for n in keys.thermal.verify]
+        named += [("thermal.train", n) for n in keys.thermal.train] + [
+            ("thermal.verify", n) for n in keys.thermal.verify
+        ]
     for flight in keys.flights:
         named += [(f"flights[{flight.id}].{k}", getattr(flight, k)) for k in ("imu", "gnss")]
         for line in flight.lines:
@@ -309,9 +325,16 @@ def _named_files(keys: CampaignKeys) -> list[tuple[str, str]]:
 def _confined(root: Path, name: str, where: Path, place: str) -> None:
     path = (root / name).resolve()
     if not name or Path(name).is_absolute() or not path.is_relative_to(root):
-        raise InputError(where, f"key '{place}'", f"'{name}' leaves the campaign folder", "move the file into the folder and name it by a relative path")
+        raise InputError(
+            where,
+            f"key '{place}'",
+            f"'{name}' leaves the campaign folder",
+            "move the file into the folder and name it by a relative path",
+        )
     if not path.exists():
-        raise InputError(where, f"key '{place}'", f"the file '{name}' does not exist", "put it there or correct the name")
+        raise InputError(
+            where, f"key '{place}'", f"the file '{name}' does not exist", "put it there or correct the name"
+        )
 
 
 def _unique(ids: list[str], where: Path, place: str) -> None:
@@ -319,10 +342,14 @@ def _unique(ids: list[str], where: Path, place: str) -> None:
         raise InputError(where, f"key '{place}'", f"'{repeated[0]}' occurs twice", "give each its own id")
 
 
-def _instrument(keys: InstrumentKeys, path: Path, has_flights: bool, has_lines: bool) -> tuple[Instrument, tuple[str, ...]]:
+def _instrument(
+    keys: InstrumentKeys, path: Path, has_flights: bool, has_lines: bool
+) -> tuple[Instrument, tuple[str, ...]]:
     def needed(place: str, part: Any, why: str) -> None:
         if part is None:
-            raise InputError(path, f"key '{place}'", f"is missing although there {why}", "add it (see the campaign format)")
+            raise InputError(
+                path, f"key '{place}'", f"is missing although there {why}", "add it (see the campaign format)"
+            )
 
     warnings: list[str] = []
     if has_flights:
@@ -337,18 +364,30 @@ def _instrument(keys: InstrumentKeys, path: Path, has_flights: bool, has_lines: 
     mounting = None
     if keys.mounting and keys.mounting.imu_to_antenna_m is not None:
         if not any(keys.mounting.imu_to_antenna_m):
-            warnings.append(f"{path.name}: mounting.imu_to_antenna_m is exactly zero: used as it stands; is it surveyed?")
+            warnings.append(
+                f"{path.name}: mounting.imu_to_antenna_m is exactly zero: used as it stands; is it surveyed?"
+            )
         boresight = keys.mounting.boresight_deg or AngleKeys()
         mounting = Mounting(
-            np.array(keys.mounting.imu_to_antenna_m), np.array(keys.mounting.imu_to_camera_m or (0.0, 0.0, 0.0)),
-            _radians(boresight), _radians(keys.mounting.imu_to_body_deg),
+            np.array(keys.mounting.imu_to_antenna_m),
+            np.array(keys.mounting.imu_to_camera_m or (0.0, 0.0, 0.0)),
+            _radians(boresight),
+            _radians(keys.mounting.imu_to_body_deg),
         )
     camera = interferometer = None
     if keys.camera:
         c = keys.camera
         camera = Camera(
-            c.rows, c.cols, c.pixel_pitch_m, c.focal_length_m, c.principal_point_px.row, c.principal_point_px.col,
-            c.frame_rate_hz, c.saturation_dn, c.radial_k1, c.latency_s,
+            c.rows,
+            c.cols,
+            c.pixel_pitch_m,
+            c.focal_length_m,
+            c.principal_point_px.row,
+            c.principal_point_px.col,
+            c.frame_rate_hz,
+            c.saturation_dn,
+            c.radial_k1,
+            c.latency_s,
         )
         if keys.interferometer:
             interferometer = _interferometer(keys.interferometer, camera, path)
@@ -359,18 +398,34 @@ def _instrument(keys: InstrumentKeys, path: Path, has_flights: bool, has_lines: 
 def _interferometer(keys: InterferometerKeys, camera: Camera, path: Path) -> Interferometer:
     low, high = keys.wavelength_range_nm
     if low >= high:
-        raise InputError(path, "key 'interferometer.wavelength_range_nm'", f"[{low:g}, {high:g}] is not a range", "give [low, high]")
+        raise InputError(
+            path, "key 'interferometer.wavelength_range_nm'", f"[{low:g}, {high:g}] is not a range", "give [low, high]"
+        )
     if not 1.0 <= keys.zpd_col <= camera.cols - 2:
-        raise InputError(path, "key 'interferometer.zpd_col'", f"{keys.zpd_col:g} is not inside the {camera.cols} columns", "phase correction needs columns on both sides of zero path difference")
+        raise InputError(
+            path,
+            "key 'interferometer.zpd_col'",
+            f"{keys.zpd_col:g} is not inside the {camera.cols} columns",
+            "phase correction needs columns on both sides of zero path difference",
+        )
     if 1e-9 * low < 2.0 * keys.opd_step_m * 0.98:
         raise InputError(
-            path, "key 'interferometer.opd_step_m'",
-            f"{keys.opd_step_m:g} m samples nothing shorter than {2e9 * keys.opd_step_m:.0f} nm without aliasing, but the range begins at {low:g} nm",
+            path,
+            "key 'interferometer.opd_step_m'",
+            f"{keys.opd_step_m:g} m samples nothing shorter than {2e9 * keys.opd_step_m:.0f} nm without aliasing, "
+            f"but the range begins at {low:g} nm",
             "correct the step (by a factor of two?) or the range",
         )
     return Interferometer(
-        camera.rows, camera.cols, keys.opd_step_m, keys.zpd_col, 1e-9 * low, 1e-9 * high,
-        keys.opd_quadratic_m, keys.fringe_tilt_m_per_row, keys.detector_nonlinearity,
+        camera.rows,
+        camera.cols,
+        keys.opd_step_m,
+        keys.zpd_col,
+        1e-9 * low,
+        1e-9 * high,
+        keys.opd_quadratic_m,
+        keys.fringe_tilt_m_per_row,
+        keys.detector_nonlinearity,
     )
 
 
@@ -383,11 +438,15 @@ def _imu_model(keys: ImuKeys) -> ImuModel:
     return ImuModel(
         keys.rate_hz,
         SensorModel(
-            float(np.deg2rad(g.angle_random_walk_deg_per_sqrt_h)) / 60.0, g.bias_sigma_deg_per_h * DEG_PER_H,
-            g.bias_correlation_time_s, 1e-6 * g.scale_factor_sigma_ppm,
+            float(np.deg2rad(g.angle_random_walk_deg_per_sqrt_h)) / 60.0,
+            g.bias_sigma_deg_per_h * DEG_PER_H,
+            g.bias_correlation_time_s,
+            1e-6 * g.scale_factor_sigma_ppm,
         ),
         SensorModel(
-            a.velocity_random_walk_ug_per_sqrt_hz * MICRO_G, a.bias_sigma_ug * MICRO_G,
-            a.bias_correlation_time_s, 1e-6 * a.scale_factor_sigma_ppm,
+            a.velocity_random_walk_ug_per_sqrt_hz * MICRO_G,
+            a.bias_sigma_ug * MICRO_G,
+            a.bias_correlation_time_s,
+            1e-6 * a.scale_factor_sigma_ppm,
         ),
     )

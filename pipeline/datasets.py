@@ -53,7 +53,9 @@ def open_dataset(path: Path) -> xr.Dataset:
         return xr.open_dataset(path, engine="h5netcdf", decode_times=False)
     except (OSError, ValueError, KeyError, RuntimeError, EOFError) as error:
         raise InputError(
-            path, "file", f"is not a readable NetCDF-4 file or Zarr store ({_one_line(error)})",
+            path,
+            "file",
+            f"is not a readable NetCDF-4 file or Zarr store ({_one_line(error)})",
             "it may be truncated: copy it again",
         ) from error
 
@@ -74,14 +76,18 @@ def take(
         values = np.asarray(variable.values, dtype=np.float64)
     except (OSError, ValueError, RuntimeError) as error:
         raise InputError(
-            path, f"variable '{name}'", f"cannot be read ({_one_line(error)})",
+            path,
+            f"variable '{name}'",
+            f"cannot be read ({_one_line(error)})",
             "the file may be truncated or the variable not numeric: write it again",
         ) from error
     if finite and not np.isfinite(values).all():
         bad = np.argwhere(~np.isfinite(values))
         first = ", ".join(f"{d} {i}" for d, i in zip(dims, bad[0], strict=True))
         raise InputError(
-            path, f"variable '{name}'", f"{len(bad)} of {values.size} values are not finite, the first at {first}",
+            path,
+            f"variable '{name}'",
+            f"{len(bad)} of {values.size} values are not finite, the first at {first}",
             "remove these records or fill them before processing",
         )
     return values
@@ -99,13 +105,17 @@ def checked(
     """The variable itself, not yet read, after its dimensions, labels, unit and shape passed."""
     if name not in dataset.variables:
         raise InputError(
-            path, f"variable '{name}'", f"is missing (the file has {', '.join(map(str, dataset.variables)) or 'none'})",
+            path,
+            f"variable '{name}'",
+            f"is missing (the file has {', '.join(map(str, dataset.variables)) or 'none'})",
             f"add {name}({', '.join(dims)})" + (f" in {unit}" if unit else ""),
         )
     variable = dataset[name]
     if set(variable.dims) != set(dims):
         raise InputError(
-            path, f"variable '{name}'", f"has dimensions ({', '.join(map(str, variable.dims))})",
+            path,
+            f"variable '{name}'",
+            f"has dimensions ({', '.join(map(str, variable.dims))})",
             f"it must be {name}({', '.join(dims)})",
         )
     variable = variable.transpose(*dims)
@@ -115,7 +125,9 @@ def checked(
         for dim, size, wanted in zip(dims, variable.shape, shape, strict=True):
             if wanted is not None and size != wanted:
                 raise InputError(
-                    path, f"variable '{name}'", f"has {size} along '{dim}' where {wanted} are expected",
+                    path,
+                    f"variable '{name}'",
+                    f"has {size} along '{dim}' where {wanted} are expected",
                     "write it again with that length or correct instrument.yaml",
                 )
     if unit is not None:
@@ -124,7 +136,10 @@ def checked(
             raise InputError(path, f"variable '{name}'", "has no attribute 'units'", f"set it to '{unit}'")
         if str(given).strip() not in UNIT_SPELLINGS[unit]:
             raise InputError(
-                path, f"variable '{name}'", f"is in '{given}'", f"the unit must be '{unit}': convert the values and the attribute",
+                path,
+                f"variable '{name}'",
+                f"is in '{given}'",
+                f"the unit must be '{unit}': convert the values and the attribute",
             )
     return variable
 
@@ -138,21 +153,28 @@ def _in_label_order(variable: xr.DataArray, path: Path, name: str, dim: str) -> 
         return variable
     if sorted(found) != sorted(labels):
         raise InputError(
-            path, f"variable '{name}'", f"has labels {found} along '{dim}'", f"they must be {list(labels)}",
+            path,
+            f"variable '{name}'",
+            f"has labels {found} along '{dim}'",
+            f"they must be {list(labels)}",
         )
     return variable.isel({dim: [found.index(label) for label in labels]})
 
 
-def take_time(dataset: xr.Dataset, path: Path, name: str = "time", *, minimum: int = 2) -> NDArray[np.float64]:
-    """A strictly increasing time axis [s] of at least `minimum` samples."""
-    time = take(dataset, path, name, (name,) if name in dataset.dims else dataset[name].dims if name in dataset else (name,), "s")
+def take_time(
+    dataset: xr.Dataset, path: Path, name: str = "time", dim: str | None = None, *, minimum: int = 2
+) -> NDArray[np.float64]:
+    """A strictly increasing time axis name(dim or name) [s] of at least `minimum` samples."""
+    time = take(dataset, path, name, (dim or name,), "s")
     if time.size < minimum:
         raise InputError(path, f"variable '{name}'", f"has {time.size} samples", f"at least {minimum} are needed")
     step = np.diff(time)
     if (step <= 0).any():
         i = int(np.argmax(step <= 0))
         raise InputError(
-            path, f"variable '{name}'", f"does not increase at sample {i + 1} ({time[i]:.6f} s then {time[i + 1]:.6f} s)",
+            path,
+            f"variable '{name}'",
+            f"does not increase at sample {i + 1} ({time[i]:.6f} s then {time[i + 1]:.6f} s)",
             "sort the records and drop repeated stamps",
         )
     return time

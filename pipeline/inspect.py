@@ -17,7 +17,7 @@ from pipeline.errors import InputError
 from pipeline.raster import Dem
 from pipeline.records import GNSS_QUALITIES, Chamber, Gnss, Imu
 
-FARTHEST_TARGET_DEG = 1.0       # from the nearest fix: farther is a mistake in the coordinates
+FARTHEST_TARGET_DEG = 1.0  # from the nearest fix: farther is a mistake in the coordinates
 
 
 @dataclass
@@ -31,10 +31,10 @@ class Inspection:
     def add(self, part: str, **items: Any) -> None:
         self.rows += [(part, name.replace("_", " "), str(value)) for name, value in items.items()]
 
-    def attempt(self, read: Callable[[], Any]) -> Any:
+    def attempt(self, read: Callable[..., Any], *arguments: Any) -> Any:
         """The result of `read`, or None with the problem noted."""
         try:
-            return read()
+            return read(*arguments)
         except InputError as problem:
             self.problems.append(problem)
             return None
@@ -52,7 +52,13 @@ def inspect_campaign(campaign: Campaign) -> Inspection:
     """Read every file of the campaign and describe it."""
     found = Inspection(warnings=list(campaign.warnings))
     keys, instrument = campaign.keys, campaign.instrument
-    found.add("campaign", name=keys.name, epoch=f"{keys.time.epoch} ({keys.time.scale})", flights=len(keys.flights), bench=len(keys.bench))
+    found.add(
+        "campaign",
+        name=keys.name,
+        epoch=f"{keys.time.epoch} ({keys.time.scale})",
+        flights=len(keys.flights),
+        bench=len(keys.bench),
+    )
     _describe_shared(campaign, found)
     if keys.thermal is None:
         if keys.flights:
@@ -60,30 +66,36 @@ def inspect_campaign(campaign: Campaign) -> Inspection:
     else:
         for role in ("train", "verify"):
             for name in getattr(keys.thermal, role):
-                chamber = found.attempt(lambda name=name: campaign.chamber(name))
+                chamber = found.attempt(campaign.chamber, name)
                 if chamber is not None:
                     _describe_chamber(f"chamber {name} ({role})", chamber, found)
     for flight in keys.flights:
-        imu = found.attempt(lambda flight=flight: campaign.imu(flight.id))
-        gnss = found.attempt(lambda flight=flight: campaign.gnss(flight.id))
+        imu = found.attempt(campaign.imu, flight.id)
+        gnss = found.attempt(campaign.gnss, flight.id)
         if imu is not None:
             assert instrument.imu is not None
             _describe_imu(f"flight {flight.id}: IMU", imu, instrument.imu.rate, found)
             if keys.thermal is not None and imu.temperatures is None:
-                found.warnings.append(f"flight {flight.id}: the IMU file has no temperatures: its data are not compensated")
+                found.warnings.append(
+                    f"flight {flight.id}: the IMU file has no temperatures: its data are not compensated"
+                )
         if gnss is not None:
             _describe_gnss(f"flight {flight.id}: GNSS", gnss, found)
         if imu is not None and gnss is not None:
-            found.attempt(lambda flight=flight, imu=imu, gnss=gnss: _clocks(campaign, flight.imu, imu, gnss))
+            found.attempt(_clocks, campaign, flight.imu, imu, gnss)
         for line in flight.lines:
             _describe_line(campaign, flight.id, line.id, imu, gnss, found)
     for bench in keys.bench:
-        record = found.attempt(lambda bench=bench: campaign.bench(bench.id))
+        record = found.attempt(campaign.bench, bench.id)
         if record is not None:
             found.add(
-                f"bench {bench.id}", scans=record.interferogram.shape[0], samples=record.opd.size,
-                OPD=f"{record.opd[0] * 1e3:.4g} to {record.opd[-1] * 1e3:.4g} mm", apodization=record.apodization or "not told",
-                phase=record.phase_correction or "not told", reference="yes" if record.reference is not None else "no",
+                f"bench {bench.id}",
+                scans=record.interferogram.shape[0],
+                samples=record.opd.size,
+                OPD=f"{record.opd[0] * 1e3:.4g} to {record.opd[-1] * 1e3:.4g} mm",
+                apodization=record.apodization or "not told",
+                phase=record.phase_correction or "not told",
+                reference="yes" if record.reference is not None else "no",
             )
     return found
 
@@ -92,12 +104,15 @@ def _describe_shared(campaign: Campaign, found: Inspection) -> None:
     keys, camera, interferometer = campaign.keys, campaign.instrument.camera, campaign.instrument.interferometer
     if camera is not None:
         found.add(
-            "camera", detector=f"{camera.rows} rows × {camera.cols} columns, {camera.pixel_pitch * 1e6:g} µm",
-            focal_length=f"{camera.focal_length * 1e3:g} mm", frame_rate=f"{camera.frame_rate:g} Hz",
+            "camera",
+            detector=f"{camera.rows} rows × {camera.cols} columns, {camera.pixel_pitch * 1e6:g} µm",
+            focal_length=f"{camera.focal_length * 1e3:g} mm",
+            frame_rate=f"{camera.frame_rate:g} Hz",
         )
     if interferometer is not None:
         found.add(
-            "interferometer", OPD_step=f"{interferometer.opd_step * 1e9:g} nm",
+            "interferometer",
+            OPD_step=f"{interferometer.opd_step * 1e9:g} nm",
             longest_OPD=f"{interferometer.longest_opd * 1e6:.2f} µm, short side {interferometer.shortest_side * 1e6:.2f} µm",
             range=f"{interferometer.wavelength_low * 1e9:g} to {interferometer.wavelength_high * 1e9:g} nm",
             resolution=f"{0.5 / interferometer.longest_opd / 100:.0f} cm-1",
@@ -106,10 +121,12 @@ def _describe_shared(campaign: Campaign, found: Inspection) -> None:
         calibration = found.attempt(campaign.calibration)
         if calibration is not None:
             found.add(
-                "calibration", dark=f"{calibration.dark.mean():.0f} DN", flat=f"{calibration.flat.min():.2f} to {calibration.flat.max():.2f}",
+                "calibration",
+                dark=f"{calibration.dark.mean():.0f} DN",
+                flat=f"{calibration.flat.min():.2f} to {calibration.flat.max():.2f}",
                 response=f"{calibration.wavenumber[0] / 100:.0f} to {calibration.wavenumber[-1] / 100:.0f} cm-1",
             )
-            found.attempt(lambda: _response_covers(campaign, calibration.wavenumber))
+            found.attempt(_response_covers, campaign, calibration.wavenumber)
     if keys.references is not None:
         references = found.attempt(campaign.references)
         if references is not None:
@@ -117,9 +134,13 @@ def _describe_shared(campaign: Campaign, found: Inspection) -> None:
     elif any(f.lines for f in keys.flights):
         found.warnings.append("no references: spectra are made but not scored")
     if keys.dem is not None:
-        dem = found.attempt(lambda: Dem.from_file(campaign.path(keys.dem or "")))
+        dem = found.attempt(Dem.from_file, campaign.path(keys.dem))
         if dem is not None:
-            found.add("terrain", cells="{} × {}".format(*dem.heights.shape), heights=f"{dem.heights.min():.1f} to {dem.heights.max():.1f} m")
+            found.add(
+                "terrain",
+                cells="{} × {}".format(*dem.heights.shape),
+                heights=f"{dem.heights.min():.1f} to {dem.heights.max():.1f} m",
+            )
 
 
 def _response_covers(campaign: Campaign, wavenumber: np.ndarray) -> None:
@@ -129,7 +150,8 @@ def _response_covers(campaign: Campaign, wavenumber: np.ndarray) -> None:
     low, high = 1.0 / interferometer.wavelength_high, 1.0 / interferometer.wavelength_low
     if wavenumber[0] > low or wavenumber[-1] < high:
         raise InputError(
-            campaign.path(campaign.keys.calibration or ""), "variable 'response'",
+            campaign.path(campaign.keys.calibration or ""),
+            "variable 'response'",
             f"covers {wavenumber[0]:.6g} to {wavenumber[-1]:.6g} m-1 but the instrument's range is {low:.6g} to {high:.6g} m-1",
             "extend the table or correct interferometer.wavelength_range_nm",
         )
@@ -138,8 +160,10 @@ def _response_covers(campaign: Campaign, wavenumber: np.ndarray) -> None:
 def _describe_chamber(part: str, chamber: Chamber, found: Inspection) -> None:
     t = chamber.temperatures
     found.add(
-        part, duration=f"{np.ptp(chamber.time) / 3600:.2f} h at {1 / np.median(np.diff(chamber.time)):.3g} Hz",
-        gyro_temperature=f"{t.gyro.min():.1f} to {t.gyro.max():.1f} °C", accelerometer_temperature=f"{t.accel.min():.1f} to {t.accel.max():.1f} °C",
+        part,
+        duration=f"{np.ptp(chamber.time) / 3600:.2f} h at {1 / np.median(np.diff(chamber.time)):.3g} Hz",
+        gyro_temperature=f"{t.gyro.min():.1f} to {t.gyro.max():.1f} °C",
+        accelerometer_temperature=f"{t.accel.min():.1f} to {t.accel.max():.1f} °C",
         attitude="given" if chamber.attitude else "not given: the run's mean is the reference",
     )
     for axis, name in enumerate("xyz"):
@@ -151,10 +175,16 @@ def _describe_imu(part: str, imu: Imu, nominal: float, found: Inspection) -> Non
     step = np.diff(imu.time)
     rate = 1.0 / float(np.median(step))
     gaps = int((step > 2.5 * np.median(step)).sum())
-    found.add(part, duration=f"{np.ptp(imu.time):.1f} s at {rate:.5g} Hz ({imu.time.size} samples)", gaps=f"{gaps}, longest {step.max():.3g} s")
+    found.add(
+        part,
+        duration=f"{np.ptp(imu.time):.1f} s at {rate:.5g} Hz ({imu.time.size} samples)",
+        gaps=f"{gaps}, longest {step.max():.3g} s",
+    )
     if imu.temperatures is not None:
         t = imu.temperatures
-        found.add(part, temperatures=f"{t.gyro.min():.1f} to {t.gyro.max():.1f} °C, {t.gyro.shape[2]} thermometers a gyro")
+        found.add(
+            part, temperatures=f"{t.gyro.min():.1f} to {t.gyro.max():.1f} °C, {t.gyro.shape[2]} thermometers a gyro"
+        )
     if not 0.8 < rate / nominal < 1.25:
         found.warnings.append(f"{part}: runs at {rate:.4g} Hz where instrument.yaml says imu.rate_hz {nominal:g}")
     if gaps:
@@ -163,11 +193,16 @@ def _describe_imu(part: str, imu: Imu, nominal: float, found: Inspection) -> Non
 
 def _describe_gnss(part: str, gnss: Gnss, found: Inspection) -> None:
     step = np.diff(gnss.time)
-    shares = ", ".join(f"{(gnss.quality == q).mean():.0%} {name}" for q, name in GNSS_QUALITIES.items() if (gnss.quality == q).any())
+    shares = ", ".join(
+        f"{(gnss.quality == q).mean():.0%} {name}" for q, name in GNSS_QUALITIES.items() if (gnss.quality == q).any()
+    )
     gaps = int((step > 2.5 * np.median(step)).sum())
     found.add(
-        part, duration=f"{np.ptp(gnss.time):.1f} s at {1 / np.median(step):.3g} Hz ({gnss.time.size} fixes)", quality=shares,
-        gaps=f"{gaps}, longest {step.max():.3g} s", velocity="given" if gnss.velocity is not None else "not given",
+        part,
+        duration=f"{np.ptp(gnss.time):.1f} s at {1 / np.median(step):.3g} Hz ({gnss.time.size} fixes)",
+        quality=shares,
+        gaps=f"{gaps}, longest {step.max():.3g} s",
+        velocity="given" if gnss.velocity is not None else "not given",
         sigma="{:.3g} m horizontal, {:.3g} m vertical (median)".format(*np.median(gnss.sigma_position[:, 1:], axis=0)),
     )
 
@@ -176,48 +211,64 @@ def _clocks(campaign: Campaign, name: str, imu: Imu, gnss: Gnss) -> None:
     inside = (gnss.time >= imu.time[0]) & (gnss.time <= imu.time[-1])
     if inside.sum() < 5:
         raise InputError(
-            campaign.path(name), "variable 'time'",
-            f"spans {imu.time[0]:.1f} to {imu.time[-1]:.1f} s but the fixes {gnss.time[0]:.1f} to {gnss.time[-1]:.1f} s: {int(inside.sum())} fixes overlap",
+            campaign.path(name),
+            "variable 'time'",
+            f"spans {imu.time[0]:.1f} to {imu.time[-1]:.1f} s but the fixes {gnss.time[0]:.1f} to {gnss.time[-1]:.1f} s: "
+            f"{int(inside.sum())} fixes overlap",
             "both must be seconds on the campaign's one clock",
         )
 
 
-def _describe_line(campaign: Campaign, flight: str, line: str, imu: Imu | None, gnss: Gnss | None, found: Inspection) -> None:
+def _describe_line(
+    campaign: Campaign, flight: str, line: str, imu: Imu | None, gnss: Gnss | None, found: Inspection
+) -> None:
     part = f"line {flight}/{line}"
     keys = campaign.line(flight, line)
-    frames = found.attempt(lambda: campaign.frames(flight, line))
+    frames = found.attempt(campaign.frames, flight, line)
     if frames is not None:
         last = frames.block(frames.time.size // 2, frames.time.size // 2 + 1)
         saturated = float((last >= campaign.instrument.camera.saturation).mean()) if campaign.instrument.camera else 0.0
         found.add(
-            part, frames=f"{frames.time.size} in {np.ptp(frames.time):.2f} s", counts=f"{last.min()} to {last.max()} DN in the middle frame, {saturated:.1%} saturated",
+            part,
+            frames=f"{frames.time.size} in {np.ptp(frames.time):.2f} s",
+            counts=f"{last.min()} to {last.max()} DN in the middle frame, {saturated:.1%} saturated",
         )
         if imu is not None:
             latency = campaign.instrument.camera.latency if campaign.instrument.camera else 0.0
             time = frames.time - latency
             outside = int(((time < imu.time[0]) | (time > imu.time[-1])).sum())
             if outside == time.size:
-                found.problems.append(InputError(
-                    campaign.path(keys.frames), "variable 'time'",
-                    f"spans {time[0]:.2f} to {time[-1]:.2f} s but the IMU {imu.time[0]:.2f} to {imu.time[-1]:.2f} s: they do not overlap",
-                    "frames and IMU must share the campaign's one clock",
-                ))
+                found.problems.append(
+                    InputError(
+                        campaign.path(keys.frames),
+                        "variable 'time'",
+                        f"spans {time[0]:.2f} to {time[-1]:.2f} s but the IMU {imu.time[0]:.2f} to {imu.time[-1]:.2f} s: "
+                        "they do not overlap",
+                        "frames and IMU must share the campaign's one clock",
+                    )
+                )
             elif outside:
                 found.warnings.append(f"{part}: {outside} frames lie outside the IMU's time and are not used")
-    targets = found.attempt(lambda: campaign.targets(flight, line))
+    targets = found.attempt(campaign.targets, flight, line)
     if targets is not None:
         found.add(part, targets=f"{len(targets.ids)} ({sum(map(bool, targets.reference))} with reference)")
         if gnss is not None:
-            away = np.rad2deg(np.hypot(
-                targets.latitude[:, None] - gnss.latitude[::10],
-                (targets.longitude[:, None] - gnss.longitude[::10]) * np.cos(gnss.latitude[0]),
-            )).min(axis=1)
+            away = np.rad2deg(
+                np.hypot(
+                    targets.latitude[:, None] - gnss.latitude[::10],
+                    (targets.longitude[:, None] - gnss.longitude[::10]) * np.cos(gnss.latitude[0]),
+                )
+            ).min(axis=1)
             if (away > FARTHEST_TARGET_DEG).any():
                 i = int(np.argmax(away))
-                found.problems.append(InputError(
-                    campaign.path(keys.targets), f"target {targets.ids[i]}", f"lies {away[i] * 111:.0f} km from the flight",
-                    "latitude and longitude may be swapped: correct the coordinates",
-                ))
-    gcps = found.attempt(lambda: campaign.gcps(flight, line))
+                found.problems.append(
+                    InputError(
+                        campaign.path(keys.targets),
+                        f"target {targets.ids[i]}",
+                        f"lies {away[i] * 111:.0f} km from the flight",
+                        "latitude and longitude may be swapped: correct the coordinates",
+                    )
+                )
+    gcps = found.attempt(campaign.gcps, flight, line)
     if gcps is not None:
         found.add(part, ground_control=f"{gcps.frame.size} points")

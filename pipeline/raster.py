@@ -37,16 +37,30 @@ class Dem:
                 heights = source.read(1, masked=True)
                 inverse, crs = ~source.transform, source.crs.to_wkt()
         except RasterioError as error:
-            raise InputError(path, "file", f"is no readable raster ({type(error).__name__})", "write it as GeoTIFF; it may be truncated") from error
+            raise InputError(
+                path,
+                "file",
+                f"is no readable raster ({type(error).__name__})",
+                "write it as GeoTIFF; it may be truncated",
+            ) from error
         values = np.asarray(heights.filled(np.nan), float)
         if not np.isfinite(values).all():
-            raise InputError(path, "band 1", f"has {int((~np.isfinite(values)).sum())} cells without height", "fill the holes of the DEM")
+            raise InputError(
+                path,
+                "band 1",
+                f"has {int((~np.isfinite(values)).sum())} cells without height",
+                "fill the holes of the DEM",
+            )
         return cls(values, inverse, crs)
 
     def height(self, latitude: Array, longitude: Array) -> Array:
         """Bilinear height [m] at geodetic positions [rad]; beyond the edge the edge's height holds on."""
         lon, lat = np.rad2deg(longitude).ravel(), np.rad2deg(latitude).ravel()
-        x, y = (lon, lat) if rasterio.crs.CRS.from_user_input(self.crs) == rasterio.crs.CRS.from_epsg(4326) else map(np.array, warp(WGS84, self.crs, lon, lat))
+        x, y = (
+            (lon, lat)
+            if rasterio.crs.CRS.from_user_input(self.crs) == rasterio.crs.CRS.from_epsg(4326)
+            else map(np.array, warp(WGS84, self.crs, lon, lat))
+        )
         col, row = self.inverse * (x, y)
         # Pixel centres lie half a pixel inside the corner that the transform refers to.
         at = map_coordinates(self.heights, [np.asarray(row) - 0.5, np.asarray(col) - 0.5], order=1, mode="nearest")
@@ -77,12 +91,26 @@ def from_crs(crs: str, x: Array, y: Array) -> tuple[Array, Array]:
     return np.deg2rad(np.reshape(lat, x.shape)), np.deg2rad(np.reshape(lon, x.shape))
 
 
-def open_cube(path: Path, crs: str, transform: Affine, shape: tuple[int, int], wavelengths_nm: Array) -> rasterio.io.DatasetWriter:
+def open_cube(
+    path: Path, crs: str, transform: Affine, shape: tuple[int, int], wavelengths_nm: Array
+) -> rasterio.io.DatasetWriter:
     """A GeoTIFF opened for writing: float32, tiled, one band a wavenumber, NaN where unseen, wavelengths as descriptions."""
     target = rasterio.open(
-        path, "w", driver="GTiff", crs=crs, transform=transform, height=shape[0], width=shape[1],
-        count=len(wavelengths_nm), dtype="float32", nodata=np.nan, tiled=True, blockxsize=128, blockysize=128,
-        interleave="band", BIGTIFF="IF_SAFER",
+        path,
+        "w",
+        driver="GTiff",
+        crs=crs,
+        transform=transform,
+        height=shape[0],
+        width=shape[1],
+        count=len(wavelengths_nm),
+        dtype="float32",
+        nodata=np.nan,
+        tiled=True,
+        blockxsize=128,
+        blockysize=128,
+        interleave="band",
+        BIGTIFF="IF_SAFER",
     )
     for band, wavelength in enumerate(wavelengths_nm, start=1):
         target.set_band_description(band, f"{wavelength:.3f} nm")

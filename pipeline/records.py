@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
@@ -55,12 +55,16 @@ def _inertial(dataset: xr.Dataset, path: Path) -> tuple[Array, Array, Array]:
     norm = float(np.median(np.linalg.norm(accel, axis=1)))
     if not 5.0 < norm < 20.0:
         raise InputError(
-            path, "variable 'accel'", f"has a median magnitude of {norm:.4g} where gravity alone is 9.8 m s-2",
+            path,
+            "variable 'accel'",
+            f"has a median magnitude of {norm:.4g} where gravity alone is 9.8 m s-2",
             "the values are not specific force in m s-2: convert them",
         )
     if (fastest := float(np.percentile(np.abs(gyro), 99))) > 20.0:
         raise InputError(
-            path, "variable 'gyro'", f"reaches {fastest:.4g} rad s-1, more than eleven hundred degrees a second",
+            path,
+            "variable 'gyro'",
+            f"reaches {fastest:.4g} rad s-1, more than eleven hundred degrees a second",
             "the values are probably in deg s-1: convert them",
         )
     return time, gyro, accel
@@ -112,7 +116,12 @@ class Chamber:
             time, gyro, accel = _inertial(dataset, path)
             temperatures = Temperatures.from_dataset(dataset, path, "time")
             if temperatures is None:
-                raise InputError(path, "temperatures", "are missing", "a chamber run needs temperature_gyro and temperature_accel, or temperature")
+                raise InputError(
+                    path,
+                    "temperatures",
+                    "are missing",
+                    "a chamber run needs temperature_gyro and temperature_accel, or temperature",
+                )
             oven = None
             if "temperature_chamber" in dataset:
                 oven = take(dataset, path, "temperature_chamber", ("time",), "degC")
@@ -124,7 +133,8 @@ class Chamber:
             if given:
                 value = {k: float(dataset.attrs[k]) for k in keys}
                 attitude = StaticAttitude(
-                    np.deg2rad(value["latitude_deg"]), value["height_m"],
+                    np.deg2rad(value["latitude_deg"]),
+                    value["height_m"],
                     *(float(np.deg2rad(value[k])) for k in ("roll_deg", "pitch_deg", "yaw_deg")),
                 )
         return cls(name, time, gyro, accel, temperatures, attitude, oven)
@@ -157,23 +167,38 @@ class Gnss:
             if "velocity" in dataset:
                 velocity = take(dataset, path, "velocity", ("time", "ned"), "m s-1", shape=(None, 3))
                 sigma_velocity = take(dataset, path, "sigma_velocity", ("time", "ned"), None, shape=(None, 3))
-            for name, sigma, unit in (("sigma_position", sigma_position, "m"), ("sigma_velocity", sigma_velocity, "m s-1")):
+            for name, sigma, unit in (
+                ("sigma_position", sigma_position, "m"),
+                ("sigma_velocity", sigma_velocity, "m s-1"),
+            ):
                 if sigma is not None:
                     if "units" in dataset[name].attrs:
                         checked(dataset, path, name, ("time", "ned"), unit)
                     if (sigma <= 0).any():
-                        raise InputError(path, f"variable '{name}'", "has values that are not positive", "give each fix its own standard deviation")
+                        raise InputError(
+                            path,
+                            f"variable '{name}'",
+                            "has values that are not positive",
+                            "give each fix its own standard deviation",
+                        )
             quality = take(dataset, path, "quality", ("time",), None).astype(np.int64)
             if unknown := sorted(set(quality.tolist()) - set(GNSS_QUALITIES)):
                 raise InputError(path, "variable 'quality'", f"has values {unknown}", "use 1 fixed, 2 float, 5 single")
-        return cls(time, np.deg2rad(latitude), np.deg2rad(longitude), height, sigma_position, velocity, sigma_velocity, quality)
+        return cls(
+            time, np.deg2rad(latitude), np.deg2rad(longitude), height, sigma_position, velocity, sigma_velocity, quality
+        )
 
 
 def _in_range(values: Array, low: float, high: float, where: Path, place: str, unit: str) -> None:
     outside = (values < low) | (values > high)
     if outside.any():
         i = int(np.argmax(outside))
-        raise InputError(where, place, f"is {values[i]:g} at record {i}, outside {low:g} to {high:g} {unit}", "latitude and longitude may be swapped")
+        raise InputError(
+            where,
+            place,
+            f"is {values[i]:g} at record {i}, outside {low:g} to {high:g} {unit}",
+            "latitude and longitude may be swapped",
+        )
 
 
 @dataclass(frozen=True)
@@ -187,14 +212,16 @@ class Frames:
     def from_file(cls, path: Path, rows: int, cols: int) -> Frames:
         """Counts stay on disk until they are sliced."""
         dataset = open_dataset(path)
-        time = take_time(dataset, path, minimum=4)
+        time = take_time(dataset, path, dim="frame", minimum=4)
         counts = checked(dataset, path, "frames", ("frame", "row", "col"), "DN", shape=(time.size, rows, cols))
         if counts.dtype != np.uint16:
             raise InputError(path, "variable 'frames'", f"is {counts.dtype}", "raw counts must be uint16")
         try:
             counts[-1].load()
         except (OSError, RuntimeError, ValueError) as error:
-            raise InputError(path, "variable 'frames'", "cannot be read to its end", "the file is truncated: copy it again") from error
+            raise InputError(
+                path, "variable 'frames'", "cannot be read to its end", "the file is truncated: copy it again"
+            ) from error
         return cls(time, counts.variable)
 
     def block(self, start: int, stop: int) -> NDArray[np.uint16]:
@@ -219,11 +246,21 @@ class Calibration:
             wavenumber = take(dataset, path, "wavenumber", ("wavenumber",), "m-1")
             response = take(dataset, path, "response", ("wavenumber",), None)
         if (flat <= 0).any():
-            raise InputError(path, "variable 'flat'", f"is not positive in {int((flat <= 0).sum())} pixels", "give dead pixels the flat of their neighbours")
+            raise InputError(
+                path,
+                "variable 'flat'",
+                f"is not positive in {int((flat <= 0).sum())} pixels",
+                "give dead pixels the flat of their neighbours",
+            )
         if (np.diff(wavenumber) <= 0).any():
             raise InputError(path, "variable 'wavenumber'", "does not increase", "sort it")
         if (response <= 0).any():
-            raise InputError(path, "variable 'response'", "has values that are not positive", "cut the table to where the instrument responds")
+            raise InputError(
+                path,
+                "variable 'response'",
+                "has values that are not positive",
+                "cut the table to where the instrument responds",
+            )
         return cls(dark, flat, wavenumber, response)
 
 
@@ -260,14 +297,21 @@ def _read_csv(path: Path, columns: tuple[str, ...], optional_empty: tuple[str, .
             rows = []
             for row in reader:
                 if None in row or any(v is None for v in row.values()):
-                    raise InputError(path, f"line {reader.line_num}", "has not as many fields as the header", f"give {','.join(columns)}")
+                    raise InputError(
+                        path,
+                        f"line {reader.line_num}",
+                        "has not as many fields as the header",
+                        f"give {','.join(columns)}",
+                    )
                 clean = {k: v.strip() for k, v in row.items()}
                 for name in columns:
                     if not clean[name] and name not in optional_empty:
                         raise InputError(path, f"line {reader.line_num}, column {name}", "is empty", "fill it in")
                 rows.append(clean | {"#": str(reader.line_num)})
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, "file", f"is not a CSV text file ({type(error).__name__})", "save it as UTF-8 CSV") from error
+        raise InputError(
+            path, "file", f"is not a CSV text file ({type(error).__name__})", "save it as UTF-8 CSV"
+        ) from error
     return rows
 
 
@@ -278,7 +322,9 @@ def _number(row: dict[str, str], name: str, path: Path, low: float = -np.inf, hi
     except ValueError:
         raise InputError(path, place, f"'{row[name]}' is not a number", "correct it") from None
     if not (low <= value <= high):
-        raise InputError(path, place, f"{value:g} is outside {low:g} to {high:g}", "columns may be swapped: correct the value")
+        raise InputError(
+            path, place, f"{value:g} is outside {low:g} to {high:g}", "columns may be swapped: correct the value"
+        )
     return value
 
 
@@ -295,7 +341,9 @@ class Targets:
 
     @classmethod
     def from_file(cls, path: Path) -> Targets:
-        rows = _read_csv(path, ("id", "latitude_deg", "longitude_deg", "height_m", "reference", "size_m"), ("reference",))
+        rows = _read_csv(
+            path, ("id", "latitude_deg", "longitude_deg", "height_m", "reference", "size_m"), ("reference",)
+        )
         if not rows:
             raise InputError(path, "file", "has a header but no target", "list at least one target or name no line")
         ids = tuple(r["id"] for r in rows)
@@ -327,11 +375,21 @@ class Gcps:
     def from_file(cls, path: Path) -> Gcps:
         names = ("frame", "row", "col", "latitude_deg", "longitude_deg", "height_m", "sigma_px")
         rows = _read_csv(path, names)
-        limits = {"latitude_deg": (-90.0, 90.0), "longitude_deg": (-180.0, 360.0), "sigma_px": (1e-6, 1e3), "frame": (0.0, 1e9)}
+        limits = {
+            "latitude_deg": (-90.0, 90.0),
+            "longitude_deg": (-180.0, 360.0),
+            "sigma_px": (1e-6, 1e3),
+            "frame": (0.0, 1e9),
+        }
         value = {n: np.array([_number(r, n, path, *limits.get(n, (-np.inf, np.inf))) for r in rows]) for n in names}
         return cls(
-            value["frame"].astype(np.int64), value["row"], value["col"],
-            np.deg2rad(value["latitude_deg"]), np.deg2rad(value["longitude_deg"]), value["height_m"], value["sigma_px"],
+            value["frame"].astype(np.int64),
+            value["row"],
+            value["col"],
+            np.deg2rad(value["latitude_deg"]),
+            np.deg2rad(value["longitude_deg"]),
+            value["height_m"],
+            value["sigma_px"],
         )
 
 
@@ -346,12 +404,15 @@ class Bench:
     apodization: str | None = None
     phase_correction: str | None = None
     zero_filling: int | None = None
-    resolution: float | None = None            # m-1
-    phase_resolution: float | None = None      # m-1
+    resolution: float | None = None  # m-1
+    phase_resolution: float | None = None  # m-1
 
-    ATTRIBUTES = {
-        "apodization": "apodization", "phase_correction": "phase_correction", "zero_filling": "zero_filling",
-        "resolution": "resolution_m-1", "phase_resolution": "phase_resolution_m-1",
+    ATTRIBUTES: ClassVar[dict[str, str]] = {
+        "apodization": "apodization",
+        "phase_correction": "phase_correction",
+        "zero_filling": "zero_filling",
+        "resolution": "resolution_m-1",
+        "phase_resolution": "phase_resolution_m-1",
     }
 
     @classmethod
@@ -363,7 +424,13 @@ class Bench:
             if "reference" in dataset:
                 wavenumber = take(dataset, path, "wavenumber", ("wavenumber",), "m-1")
                 reference = take(dataset, path, "reference", ("wavenumber",), None)
-            kinds = {"apodization": str, "phase_correction": str, "zero_filling": int, "resolution": float, "phase_resolution": float}
+            kinds = {
+                "apodization": str,
+                "phase_correction": str,
+                "zero_filling": int,
+                "resolution": float,
+                "phase_resolution": float,
+            }
             given = {}
             for key, kind in kinds.items():
                 if cls.ATTRIBUTES[key] in dataset.attrs:
@@ -371,7 +438,12 @@ class Bench:
                     try:
                         given[key] = kind(raw)
                     except (TypeError, ValueError):
-                        raise InputError(path, f"attribute '{cls.ATTRIBUTES[key]}'", f"'{raw}' is not a {kind.__name__}", "correct it") from None
+                        raise InputError(
+                            path,
+                            f"attribute '{cls.ATTRIBUTES[key]}'",
+                            f"'{raw}' is not a {kind.__name__}",
+                            "correct it",
+                        ) from None
         if (np.diff(opd) <= 0).any():
             raise InputError(path, "variable 'opd'", "does not increase", "sort the samples by optical path difference")
         return cls(interferogram, opd, wavenumber, reference, **given)
@@ -383,7 +455,11 @@ class Bench:
         }
         coords = {}
         if self.wavenumber is not None and self.reference is not None:
-            variables["reference"] = (("wavenumber",), self.reference, {"long_name": "the vendor's spectrum of the same scan"})
+            variables["reference"] = (
+                ("wavenumber",),
+                self.reference,
+                {"long_name": "the vendor's spectrum of the same scan"},
+            )
             coords["wavenumber"] = (("wavenumber",), self.wavenumber, {"units": "m-1"})
         attrs = {name: getattr(self, key) for key, name in self.ATTRIBUTES.items() if getattr(self, key) is not None}
         return xr.Dataset(variables, coords, attrs)
@@ -427,11 +503,17 @@ class Trajectory:
                 "sigma_velocity": (ned, self.sigma_velocity, {"units": "m s-1"}),
                 "sigma_attitude": (("time", "rpy"), deg(self.sigma_attitude), {"units": "degrees"}),
                 "rate": (axis, self.rate, {"units": "rad s-1", "long_name": "compensated angular rate, body axes"}),
-                "specific_force": (axis, self.specific_force, {"units": "m s-2", "long_name": "compensated, body axes"}),
+                "specific_force": (
+                    axis,
+                    self.specific_force,
+                    {"units": "m s-2", "long_name": "compensated, body axes"},
+                ),
             },
             {
                 "time": (time, self.time, {"units": "s", "long_name": "seconds after the campaign's epoch"}),
-                "ned": list(("north", "east", "down")), "rpy": ["roll", "pitch", "yaw"], "axis": ["x", "y", "z"],
+                "ned": list(("north", "east", "down")),
+                "rpy": ["roll", "pitch", "yaw"],
+                "axis": ["x", "y", "z"],
             },
         )
 
@@ -481,9 +563,21 @@ class Tracks:
         pixel = {"units": "1"}
         return xr.Dataset(
             {
-                "row": (centre, self.row[:, :, self.CENTRE], pixel | {"long_name": "detector row of the target's centre"}),
-                "col": (centre, self.col[:, :, self.CENTRE], pixel | {"long_name": "detector column of the target's centre"}),
-                "point_row": (every, self.row, pixel | {"long_name": "detector row of the points that the area averages"}),
+                "row": (
+                    centre,
+                    self.row[:, :, self.CENTRE],
+                    pixel | {"long_name": "detector row of the target's centre"},
+                ),
+                "col": (
+                    centre,
+                    self.col[:, :, self.CENTRE],
+                    pixel | {"long_name": "detector column of the target's centre"},
+                ),
+                "point_row": (
+                    every,
+                    self.row,
+                    pixel | {"long_name": "detector row of the points that the area averages"},
+                ),
                 "point_col": (every, self.col, pixel | {"long_name": "detector column of these points"}),
             },
             {"method": list(self.methods), "target": list(self.targets)},
@@ -495,16 +589,21 @@ class Tracks:
         every = ("method", "target", "point", "frame")
         with open_dataset(path) as d:
             return cls(
-                tuple(map(str, d["method"].values)), tuple(map(str, d["target"].values)),
-                take(d, path, "point_row", every, "1", finite=False), take(d, path, "point_col", every, "1", finite=False),
+                tuple(map(str, d["method"].values)),
+                tuple(map(str, d["target"].values)),
+                take(d, path, "point_row", every, "1", finite=False),
+                take(d, path, "point_col", every, "1", finite=False),
                 {k.removeprefix("note_"): str(v) for k, v in d.attrs.items() if k.startswith("note_")},
             )
 
     def joined(self, other: Tracks) -> Tracks:
         """The methods of both, for the same targets and frames."""
         return Tracks(
-            self.methods + other.methods, self.targets,
-            np.concatenate([self.row, other.row]), np.concatenate([self.col, other.col]), self.notes | other.notes,
+            self.methods + other.methods,
+            self.targets,
+            np.concatenate([self.row, other.row]),
+            np.concatenate([self.col, other.col]),
+            self.notes | other.notes,
         )
 
 
@@ -536,10 +635,15 @@ class Spectra:
             {
                 **{n: (dims, getattr(self, n), unit) for n in self.SPECTRA},
                 "reference": (dims[1:], self.reference, unit | {"long_name": "reference at the scored line shape"}),
-                "points": (dims[:2], self.points, {"units": "1", "long_name": "points of the area seen on enough columns"}),
+                "points": (
+                    dims[:2],
+                    self.points,
+                    {"units": "1", "long_name": "points of the area seen on enough columns"},
+                ),
             },
             {
-                "method": list(self.methods), "target": list(self.targets),
+                "method": list(self.methods),
+                "target": list(self.targets),
                 "wavenumber": (("wavenumber",), self.wavenumber, {"units": "m-1"}),
             },
             dict(self.attributes),
@@ -551,8 +655,10 @@ class Spectra:
         with open_dataset(path) as d:
             spectra = {n: take(d, path, n, dims, None, finite=False) for n in cls.SPECTRA}
             return cls(
-                tuple(map(str, d["method"].values)), tuple(map(str, d["target"].values)),
-                take(d, path, "wavenumber", ("wavenumber",), "m-1"), **spectra,
+                tuple(map(str, d["method"].values)),
+                tuple(map(str, d["target"].values)),
+                take(d, path, "wavenumber", ("wavenumber",), "m-1"),
+                **spectra,
                 reference=take(d, path, "reference", dims[1:], None, finite=False),
                 points=take(d, path, "points", dims[:2], "1").astype(np.int64),
                 attributes={str(k): v for k, v in d.attrs.items()},
@@ -578,7 +684,8 @@ class ThermalCorrection:
         dims = ("time", "axis")
         return xr.Dataset(
             {
-                "gyro": (dims, self.gyro, {"units": "rad s-1"}), "accel": (dims, self.accel, {"units": "m s-2"}),
+                "gyro": (dims, self.gyro, {"units": "rad s-1"}),
+                "accel": (dims, self.accel, {"units": "m s-2"}),
                 "sigma_gyro": (dims, self.sigma_gyro, {"units": "rad s-1"}),
                 "sigma_accel": (dims, self.sigma_accel, {"units": "m s-2"}),
                 "distance": (("time", "channel"), self.distance, {"units": "1"}),
@@ -591,8 +698,11 @@ class ThermalCorrection:
         dims = ("time", "axis")
         with open_dataset(path) as d:
             return cls(
-                take_time(d, path), take(d, path, "gyro", dims, "rad s-1"), take(d, path, "accel", dims, "m s-2"),
-                take(d, path, "sigma_gyro", dims, "rad s-1"), take(d, path, "sigma_accel", dims, "m s-2"),
+                take_time(d, path),
+                take(d, path, "gyro", dims, "rad s-1"),
+                take(d, path, "accel", dims, "m s-2"),
+                take(d, path, "sigma_gyro", dims, "rad s-1"),
+                take(d, path, "sigma_accel", dims, "m s-2"),
                 take(d, path, "distance", ("time", "channel"), "1"),
             )
 
@@ -609,7 +719,11 @@ class CameraPoses:
         return xr.Dataset(
             {
                 "centre": (("frame", "ecef"), self.centre, {"units": "m"}),
-                "dcm": (("frame", "ecef", "camera"), self.dcm, {"units": "1", "long_name": "camera axes in ECEF, by column"}),
+                "dcm": (
+                    ("frame", "ecef", "camera"),
+                    self.dcm,
+                    {"units": "1", "long_name": "camera axes in ECEF, by column"},
+                ),
             },
             {"time": (("frame",), self.time, {"units": "s", "long_name": "mid-exposure time, latency taken off"})},
         )
@@ -618,7 +732,8 @@ class CameraPoses:
     def from_file(cls, path: Path) -> CameraPoses:
         with open_dataset(path) as d:
             return cls(
-                take(d, path, "time", ("frame",), "s"), take(d, path, "centre", ("frame", "ecef"), "m", finite=False),
+                take(d, path, "time", ("frame",), "s"),
+                take(d, path, "centre", ("frame", "ecef"), "m", finite=False),
                 take(d, path, "dcm", ("frame", "ecef", "camera"), "1", finite=False),
             )
 
@@ -667,7 +782,8 @@ class Interferograms:
         dims = ("method", "target", "point", "col")
         with open_dataset(path) as d:
             return cls(
-                tuple(map(str, d["method"].values)), tuple(map(str, d["target"].values)),
+                tuple(map(str, d["method"].values)),
+                tuple(map(str, d["target"].values)),
                 take(d, path, "value", dims, "DN", finite=False),
                 *(take(d, path, n, dims, "1", finite=False) for n in ("gain", "row", "crossings")),
             )

@@ -43,10 +43,10 @@ class StageRecord:
 
     stage: str
     unit: str
-    status: str                 # done, or failed
+    status: str  # done, or failed
     cached: bool
-    seconds: float              # of the run that made the outputs
-    digest: str                 # the key
+    seconds: float  # of the run that made the outputs
+    digest: str  # the key
     summary: dict[str, Any]
     error: str | None = None
 
@@ -71,14 +71,28 @@ def run_stage(
     force: run even on a hit. forbid: raise InputError instead of running on a miss.
     """
     manifest = out / FOLDER / f"{stage}@{unit.replace('/', '@')}.json"
-    key = _digest_text(json.dumps({
-        "stage": stage, "unit": unit, "parameters": parameters, "outputs": dict(outputs),
-        "inputs": {n: file_digest(p) for n, p in sorted(inputs.items())}, "code": code_digest(module),
-    }, sort_keys=True))
+    key = _digest_text(
+        json.dumps(
+            {
+                "stage": stage,
+                "unit": unit,
+                "parameters": parameters,
+                "outputs": dict(outputs),
+                "inputs": {n: file_digest(p) for n, p in sorted(inputs.items())},
+                "code": code_digest(module),
+            },
+            sort_keys=True,
+        )
+    )
     if not force and (known := _current(manifest, key, out)):
         return StageRecord(stage, unit, "done", True, known["seconds"], key, known["summary"])
     if forbid:
-        raise InputError(out, f"stage {stage} of {unit}", "has no current result", f"run it first: `--from {stage}` or no stage option")
+        raise InputError(
+            out,
+            f"stage {stage} of {unit}",
+            "has no current result",
+            f"run it first: `--from {stage}` or no stage option",
+        )
     manifest.parent.mkdir(parents=True, exist_ok=True)
     manifest.unlink(missing_ok=True)
     scratch = manifest.with_suffix(f".{os.getpid()}.{threading.get_ident()}.tmp")

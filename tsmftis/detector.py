@@ -17,7 +17,7 @@ from tsmftis.fourier import apodization, quadrature, transform
 
 Array = NDArray[np.float64]
 
-NONLINEARITY_SCALE = 12000.0        # DN; recorded s' = s·(1 − a·s/12000)
+NONLINEARITY_SCALE = 12000.0  # DN; recorded s' = s·(1 − a·s/12000)
 
 
 def correct(
@@ -39,7 +39,9 @@ def correct(
     return signal.astype(np.float32, copy=False)
 
 
-def noise_out_of_band(interferogram: Array, gain: Array, opd: Array, shortest_wavelength: float, longest_wavelength: float) -> Array:
+def noise_out_of_band(
+    interferogram: Array, gain: Array, opd: Array, shortest_wavelength: float, longest_wavelength: float
+) -> Array:
     """Variance of one pixel (...,) from interferograms (..., n) and their noise gains (..., n), opd (n,).
 
     E|Σ w·I·dx·e^{−2πiσx}|² = var·Σ w²·gain·dx² at a wavenumber without light. The band lies between 1/λ_low and Nyquist

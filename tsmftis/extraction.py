@@ -35,7 +35,9 @@ def _columns(c0: float, c1: float, cols: int) -> Any:
 
 
 @numba.njit(cache=True, nogil=True)
-def _cross(frames: Any, k: int, r0: float, c0: float, r1: float, c1: float, value: Any, gain: Any, weight: Any, mean_row: Any) -> None:
+def _cross(
+    frames: Any, k: int, r0: float, c0: float, r1: float, c1: float, value: Any, gain: Any, weight: Any, mean_row: Any
+) -> None:
     """Add the columns crossed between frames k and k+1 of the block to one point's sums."""
     _, rows, cols = frames.shape
     if not (np.isfinite(c0) and np.isfinite(c1)) or c0 == c1:
@@ -62,7 +64,9 @@ def _cross(frames: Any, k: int, r0: float, c0: float, r1: float, c1: float, valu
 
 
 @numba.njit(cache=True, nogil=True)
-def along_tracks(frames: Any, first: int, row: Any, col: Any, value: Any, gain: Any, weight: Any, mean_row: Any) -> None:
+def along_tracks(
+    frames: Any, first: int, row: Any, col: Any, value: Any, gain: Any, weight: Any, mean_row: Any
+) -> None:
     """Add the crossings between consecutive frames of a block to the sums of points with known tracks.
 
     frames (f, rows, cols): corrected counts of frames first … first+f−1, NaN in bad or saturated pixels; row, col
@@ -71,13 +75,25 @@ def along_tracks(frames: Any, first: int, row: Any, col: Any, value: Any, gain: 
     for p in range(row.shape[0]):
         for k in range(frames.shape[0] - 1):
             i = first + k
-            _cross(frames, k, row[p, i], col[p, i], row[p, i + 1], col[p, i + 1], value[p], gain[p], weight[p], mean_row[p])
+            _cross(
+                frames, k, row[p, i], col[p, i], row[p, i + 1], col[p, i + 1], value[p], gain[p], weight[p], mean_row[p]
+            )
 
 
 @numba.njit(cache=True, nogil=True)
 def over_cells(
-    frames: Any, points: Any, centre: Any, dcm: Any, scale: float, row0: float, col0: float, k1: float,
-    value: Any, gain: Any, weight: Any, mean_row: Any,
+    frames: Any,
+    points: Any,
+    centre: Any,
+    dcm: Any,
+    scale: float,
+    row0: float,
+    col0: float,
+    k1: float,
+    value: Any,
+    gain: Any,
+    weight: Any,
+    mean_row: Any,
 ) -> None:
     """`along_tracks` for ground points (cell, 3) in ECEF, projected frame by frame instead of stored tracks.
 

@@ -29,6 +29,8 @@ References
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -109,7 +111,8 @@ def remove_constant(interferogram: Array, opd: Array, order: int) -> Array:
         q, _ = np.linalg.qr(basis)
         return interferogram - (interferogram @ q) @ q.T
     q, _ = np.linalg.qr(basis)
-    return interferogram - np.einsum("...nk,...k->...n", q, np.einsum("...nk,...n->...k", q, interferogram))
+    drift: Array = np.einsum("...nk,...k->...n", q, np.einsum("...nk,...n->...k", q, interferogram))
+    return interferogram - drift
 
 
 def transform(interferogram: Array, opd: Array, window: Array, wavenumber: Array) -> Complex:
@@ -118,7 +121,10 @@ def transform(interferogram: Array, opd: Array, window: Array, wavenumber: Array
     if opd.ndim == 1:
         angle = 2.0 * np.pi * np.outer(opd, wavenumber)
         return weighted @ np.cos(angle) - 1j * (weighted @ np.sin(angle))
-    flat, x = weighted.reshape(-1, weighted.shape[-1]), np.broadcast_to(opd, weighted.shape).reshape(-1, weighted.shape[-1])
+    flat, x = (
+        weighted.reshape(-1, weighted.shape[-1]),
+        np.broadcast_to(opd, weighted.shape).reshape(-1, weighted.shape[-1]),
+    )
     out = np.empty((len(flat), wavenumber.size), complex)
     for i, (row, at) in enumerate(zip(flat, x, strict=True)):
         out[i] = np.exp(-2j * np.pi * np.outer(wavenumber, at)) @ row
@@ -133,7 +139,7 @@ def phase_polynomial(spectrum: Complex, wavenumber: Array, order: int, rounds: i
     """
     u = _unit(wavenumber)
     weight = np.abs(spectrum) / np.abs(spectrum).max()
-    coefficients = np.polynomial.polynomial.polyfit(u, np.unwrap(np.angle(spectrum)), order, w=weight)
+    coefficients: NDArray[Any] = np.polynomial.polynomial.polyfit(u, np.unwrap(np.angle(spectrum)), order, w=weight)
     for _ in range(rounds):
         left = np.angle(spectrum * np.exp(-1j * np.polynomial.polynomial.polyval(u, coefficients)))
         coefficients = coefficients + np.polynomial.polynomial.polyfit(u, left, order, w=weight)
@@ -142,7 +148,7 @@ def phase_polynomial(spectrum: Complex, wavenumber: Array, order: int, rounds: i
 
 def smooth_phase(coefficients: Array, wavenumber: Array) -> Array:
     """φ [rad] on the wavenumbers that the coefficients were fitted on."""
-    return np.polynomial.polynomial.polyval(_unit(wavenumber), coefficients)
+    return np.asarray(np.polynomial.polynomial.polyval(_unit(wavenumber), coefficients), float)
 
 
 def _unit(wavenumber: Array) -> Array:
@@ -150,7 +156,13 @@ def _unit(wavenumber: Array) -> Array:
 
 
 def radiance(
-    interferogram: Array, opd: Array, window: Array, wavenumber: Array, phase: Array, response: Array, variance: Array | None = None
+    interferogram: Array,
+    opd: Array,
+    window: Array,
+    wavenumber: Array,
+    phase: Array,
+    response: Array,
+    variance: Array | None = None,
 ) -> tuple[Array, Array]:
     """B = 4·Re(S·exp(−iφ))/R and its sigma; the window must hold a Mertz ramp.
 
@@ -166,10 +178,15 @@ def radiance(
         gain = np.cos(2.0 * np.pi * np.outer(opd, wavenumber) + phase) ** 2
         total = (variance * weight) @ gain
     else:
-        flat, w, x = (np.broadcast_to(a, variance.shape).reshape(-1, variance.shape[-1]) for a in (variance, weight, opd))
-        total = np.stack([
-            (v * ww) @ np.cos(2.0 * np.pi * np.outer(at, wavenumber) + phase) ** 2 for v, ww, at in zip(flat, w, x, strict=True)
-        ]).reshape(*variance.shape[:-1], wavenumber.size)
+        flat, w, x = (
+            np.broadcast_to(a, variance.shape).reshape(-1, variance.shape[-1]) for a in (variance, weight, opd)
+        )
+        total = np.stack(
+            [
+                (v * ww) @ np.cos(2.0 * np.pi * np.outer(at, wavenumber) + phase) ** 2
+                for v, ww, at in zip(flat, w, x, strict=True)
+            ]
+        ).reshape(*variance.shape[:-1], wavenumber.size)
     return value, 4.0 * np.sqrt(total) / response
 
 
@@ -181,7 +198,7 @@ def line_shape_response(
     spectrum (..., m) and response (m,) on table_wavenumber (m,) [m-1] → (..., k). The interferogram is two-sided and free
     of noise: F(x) = ∫ R·B·cos(2πσx) dσ, B' = 2∫ w(x)·F(x)·cos(2πσx) dx / R.
     """
-    step = 0.2 / table_wavenumber[-1]               # five samples a period of the shortest wave
+    step = 0.2 / table_wavenumber[-1]  # five samples a period of the shortest wave
     count = int(np.ceil(longest_opd / step))
     x = np.linspace(0.0, longest_opd, count + 1)
     forward = np.cos(2.0 * np.pi * np.outer(table_wavenumber, x)) * (response * np.gradient(table_wavenumber))[:, None]

@@ -15,22 +15,24 @@ References
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SEMI_MAJOR_AXIS = 6378137.0                    # m
+SEMI_MAJOR_AXIS = 6378137.0  # m
 FLATTENING = 1.0 / 298.257223563
 ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
-EARTH_RATE = 7.292115e-5                       # rad/s
-GM = 3.986004418e14                            # m³/s²
-GRAVITY_EQUATOR = 9.7803253359                 # m/s²
+EARTH_RATE = 7.292115e-5  # rad/s
+GM = 3.986004418e14  # m³/s²
+GRAVITY_EQUATOR = 9.7803253359  # m/s²
 SOMIGLIANA_K = 0.00193185265241
-STANDARD_GRAVITY = 9.80665                     # m/s², defines the µg
+STANDARD_GRAVITY = 9.80665  # m/s², defines the µg
 
 
-def radii_of_curvature(latitude: Array | float) -> tuple[Array, Array]:
+def radii_of_curvature(latitude: Any) -> tuple[Any, Any]:
     """Meridian R_N = a(1−e²)/(1−e²sin²L)^1.5 and prime-vertical R_E = a/√(1−e²sin²L) [m] at latitude L [rad]."""
     s = 1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
     return (
@@ -39,7 +41,7 @@ def radii_of_curvature(latitude: Array | float) -> tuple[Array, Array]:
     )
 
 
-def normal_gravity(latitude: Array | float, height: Array | float) -> Array:
+def normal_gravity(latitude: Any, height: Any) -> Any:
     """Normal gravity, positive down [m/s²], at latitude [rad] and ellipsoidal height [m].
 
     γ = γ₀(L)·(1 − 2(1 + f + m − 2f sin²L)·h/a + 3h²/a²), γ₀ by Somigliana [1]_.
@@ -47,14 +49,12 @@ def normal_gravity(latitude: Array | float, height: Array | float) -> Array:
     s2 = np.sin(latitude) ** 2
     surface = GRAVITY_EQUATOR * (1.0 + SOMIGLIANA_K * s2) / np.sqrt(1.0 - ECCENTRICITY_SQUARED * s2)
     m = EARTH_RATE**2 * SEMI_MAJOR_AXIS**3 * (1.0 - FLATTENING) / GM
-    return np.asarray(
-        surface
-        * (
-            1.0
-            - 2.0 / SEMI_MAJOR_AXIS * (1.0 + FLATTENING + m - 2.0 * FLATTENING * s2) * height
-            + 3.0 * (np.asarray(height) / SEMI_MAJOR_AXIS) ** 2
-        )
+    height_term = (
+        1.0
+        - 2.0 / SEMI_MAJOR_AXIS * (1.0 + FLATTENING + m - 2.0 * FLATTENING * s2) * height
+        + 3.0 * (height / SEMI_MAJOR_AXIS) ** 2
     )
+    return surface * height_term
 
 
 def earth_rate_ned(latitude: Array | float) -> Array:
@@ -98,7 +98,11 @@ def ned_to_ecef_dcm(latitude: Array | float, longitude: Array | float) -> Array:
     sl, cl, so, co = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
     zero = np.zeros_like(sl)
     return np.stack(
-        [np.stack([-sl * co, -so, -cl * co], -1), np.stack([-sl * so, co, -cl * so], -1), np.stack([cl, zero, -sl], -1)],
+        [
+            np.stack([-sl * co, -so, -cl * co], -1),
+            np.stack([-sl * so, co, -cl * so], -1),
+            np.stack([cl, zero, -sl], -1),
+        ],
         -2,
     )
 

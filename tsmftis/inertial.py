@@ -8,8 +8,8 @@ import numpy as np
 
 from tsmftis.geodesy import STANDARD_GRAVITY
 
-DEG_PER_H = np.deg2rad(1.0) / 3600.0           # rad/s
-MICRO_G = 1e-6 * STANDARD_GRAVITY              # m/s²
+DEG_PER_H = np.deg2rad(1.0) / 3600.0  # rad/s
+MICRO_G = 1e-6 * STANDARD_GRAVITY  # m/s²
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class Interferometer:
     fringe_tilt: float = 0.0
     detector_nonlinearity: float = 0.0
 
-    def opd(self, row: Array | float, col: Array | float) -> Array:
+    def opd(self, row: ArrayLike, col: ArrayLike) -> Array:
         """OPD [m] at detector positions; row and col broadcast."""
         d = np.asarray(col, float) - self.zpd_col
         return (

@@ -5,6 +5,8 @@ Functions
 rpy_to_dcm, dcm_to_rpy      C_body→NED = Rz(yaw)·Ry(pitch)·Rx(roll) and back
 exp_so3                     rotation vector → DCM
 log_so3                     DCM → rotation vector
+dcm_to_quaternion, quaternion_to_dcm
+rpy_jacobian                errors of roll, pitch, yaw from a rotation error in NED
 skew                        cross-product matrix
 Attitude                    an attitude history, interpolated smoothly in time
 
@@ -27,9 +29,7 @@ Array = NDArray[np.float64]
 
 def rpy_to_dcm(roll: Array | float, pitch: Array | float, yaw: Array | float) -> Array:
     """C = Rz(yaw)·Ry(pitch)·Rx(roll); angles (...) [rad] → (..., 3, 3)."""
-    roll, pitch, yaw = np.broadcast_arrays(
-        np.asarray(roll, float), np.asarray(pitch, float), np.asarray(yaw, float)
-    )
+    roll, pitch, yaw = np.broadcast_arrays(np.asarray(roll, float), np.asarray(pitch, float), np.asarray(yaw, float))
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
     rows = (
         (cp * cy, sr * sp * cy - cr * sy, cr * sp * cy + sr * sy),
@@ -59,14 +59,41 @@ def log_so3(dcm: Array) -> Array:
     return Rotation.from_matrix(m.reshape(-1, 3, 3)).as_rotvec().reshape(*m.shape[:-2], 3)
 
 
+def dcm_to_quaternion(dcm: Array) -> Array:
+    """DCM (..., 3, 3) → unit quaternion (..., 4) as (w, x, y, z)."""
+    m = np.asarray(dcm, float)
+    return Rotation.from_matrix(m.reshape(-1, 3, 3)).as_quat(scalar_first=True).reshape(*m.shape[:-2], 4)
+
+
+def quaternion_to_dcm(quaternion: Array) -> Array:
+    """Unit quaternion (..., 4) as (w, x, y, z) → DCM (..., 3, 3)."""
+    q = np.asarray(quaternion, float)
+    return Rotation.from_quat(q.reshape(-1, 4), scalar_first=True).as_matrix().reshape(*q.shape[:-1], 3, 3)
+
+
+def rpy_jacobian(rpy: Array) -> Array:
+    """∂(roll, pitch, yaw)/∂φ for C_true = exp(φ×)·C, φ in NED; (n, 3) → (n, 3, 3).
+
+    δroll = (cos y·φ_N + sin y·φ_E)/cos p, δpitch = −sin y·φ_N + cos y·φ_E, δyaw = φ_D + tan p·(cos y·φ_N + sin y·φ_E).
+    """
+    _, p, y = rpy.T
+    zero, one = np.zeros_like(p), np.ones_like(p)
+    return np.stack(
+        [
+            np.stack([np.cos(y) / np.cos(p), np.sin(y) / np.cos(p), zero], -1),
+            np.stack([-np.sin(y), np.cos(y), zero], -1),
+            np.stack([np.tan(p) * np.cos(y), np.tan(p) * np.sin(y), one], -1),
+        ],
+        -2,
+    )
+
+
 def skew(v: Array) -> Array:
     """[v×] with [v×]w = v × w; (..., 3) → (..., 3, 3)."""
     v = np.asarray(v, float)
     zero = np.zeros(v.shape[:-1])
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack(
-        [np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2
-    )
+    return np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2)
 
 
 @dataclass(frozen=True)

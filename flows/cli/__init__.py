@@ -13,8 +13,12 @@ from pipeline.errors import TsmftisError
 from tsmftis import __version__
 
 app = typer.Typer(
-    name="tsmftis", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None,
-    help="Post-processing for airborne imaging Fourier spectrometry: a campaign folder in, spectra, trajectory, maps and scores out.",
+    name="tsmftis",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Post-processing for airborne imaging Fourier spectrometry: a campaign in, spectra, trajectory, maps, scores out.",
 )
 app.command("inspect")(inspecting.inspect)
 app.command("run")(running.run)
@@ -30,7 +34,9 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
 ) -> None:
     pass
 

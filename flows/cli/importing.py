@@ -37,6 +37,7 @@ def import_opus(
     scans, samples = bench.interferogram.shape
     Console(highlight=False, soft_wrap=True).print(
         f"{out}: {scans} scan{'s' if scans > 1 else ''} of {samples} samples, apodization {bench.apodization or 'not told'}, "
-        f"phase {bench.phase_correction or 'not told'}, vendor's spectrum {'included' if bench.reference is not None else 'not in the file'}",
+        f"phase {bench.phase_correction or 'not told'}, "
+        f"vendor's spectrum {'included' if bench.reference is not None else 'not in the file'}",
         markup=False,
     )

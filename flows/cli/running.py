@@ -21,11 +21,31 @@ from pipeline.run_stage import StageRecord
 def run(
     campaign: Annotated[Path, typer.Argument(help="Campaign folder (it holds campaign.yaml).")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the results; made if need be.")],
-    start: Annotated[str | None, typer.Option("--from", metavar="STAGE", help=f"Run this stage and those after it again: {', '.join(STAGES)}.")] = None,
-    only: Annotated[str | None, typer.Option("--only", metavar="STAGE", help="Run this stage alone, on the results that are there.")] = None,
-    line: Annotated[list[str] | None, typer.Option("--line", metavar="ID", help="Only this line (LINE or FLIGHT/LINE); may be repeated.")] = None,
-    assignments: Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting, for instance navigation.epoch_s=0.05; may be repeated.")] = None,
-    settings_file: Annotated[Path | None, typer.Option("--settings", metavar="FILE", help="YAML file of settings (configs/settings.yaml lists all).")] = None,
+    start: Annotated[
+        str | None,
+        typer.Option("--from", metavar="STAGE", help=f"Run this stage and those after it again: {', '.join(STAGES)}."),
+    ] = None,
+    only: Annotated[
+        str | None, typer.Option("--only", metavar="STAGE", help="Run this stage alone, on the results that are there.")
+    ] = None,
+    line: Annotated[
+        list[str] | None,
+        typer.Option("--line", metavar="ID", help="Only this line (LINE or FLIGHT/LINE); may be repeated."),
+    ] = None,
+    assignments: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="A setting, for instance navigation.epoch_s=0.05; may be repeated."
+        ),
+    ] = None,
+    dask: Annotated[
+        str | None,
+        typer.Option("--dask", metavar="ADDRESS", help="Run on a Dask scheduler, or 'local' (needs the extra 'dask')."),
+    ] = None,
+    settings_file: Annotated[
+        Path | None,
+        typer.Option("--settings", metavar="FILE", help="YAML file of settings (configs/settings.yaml lists all)."),
+    ] = None,
 ) -> None:
     """Process a campaign. Only what changed since the last run into the same folder runs again.
 
@@ -42,7 +62,12 @@ def run(
     opened = read_campaign(campaign)
     known = {i for f in opened.keys.flights for entry in f.lines for i in (entry.id, f"{f.id}/{entry.id}")}
     if unknown := [i for i in plan.lines if i not in known]:
-        raise InputError("--line", f"'{unknown[0]}'", "is not in the campaign", f"use one of {', '.join(sorted(known)) or 'none: it has no lines'}")
+        raise InputError(
+            "--line",
+            f"'{unknown[0]}'",
+            "is not in the campaign",
+            f"use one of {', '.join(sorted(known)) or 'none: it has no lines'}",
+        )
     if plan.out.exists() and not plan.out.is_dir():
         raise InputError(out, "--out", "is a file", "give a folder")
     if plan.out == plan.campaign or plan.campaign.is_relative_to(plan.out):
@@ -64,7 +89,7 @@ def run(
         if record.error:
             console.print(f"  {record.error}", style="red", markup=False)
 
-    records = run_campaign(plan, say)
+    records = run_campaign(plan, say, dask)
     content = assemble(plan, records)
     write_run(plan, content)
     report = write_report(opened, plan.out, content, settings.model_dump(mode="json"), inspection.warnings)
@@ -78,7 +103,9 @@ def print_scores(console: Console, content: dict[str, Any]) -> None:
     """The RQE table of a run, if it has scores."""
     if not content.get("rqe"):
         return
-    table = Table(title="RQE, mean over all targets", show_edge=False, header_style="bold", pad_edge=False, title_justify="left")
+    table = Table(
+        title="RQE, mean over all targets", show_edge=False, header_style="bold", pad_edge=False, title_justify="left"
+    )
     table.add_column("method")
     for name in ("one point", "area mean"):
         table.add_column(name, justify="right")

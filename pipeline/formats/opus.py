@@ -28,15 +28,22 @@ Channel = Literal["sample", "reference"]
 
 # Interferogram, spectrum and parameters of each channel, as brukeropus names them.
 CHANNELS: dict[Channel, tuple[str, str, str]] = {
-    "sample": ("igsm", "sm", "params"), "reference": ("igrf", "rf", "rf_params"),
+    "sample": ("igsm", "sm", "params"),
+    "reference": ("igrf", "rf", "rf_params"),
 }
 # APF and PHZ codes → our names; an unknown code keeps its own, so that who reads the record can say what is unknown.
 APODIZATION = {
-    "BX": "boxcar", "TR": "triangle", "HG": "happ-genzel", "B3": "blackman-harris-3", "B4": "blackman-harris-4",
-    "NBW": "norton-beer-weak", "NBM": "norton-beer-medium", "NBS": "norton-beer-strong",
+    "BX": "boxcar",
+    "TR": "triangle",
+    "HG": "happ-genzel",
+    "B3": "blackman-harris-3",
+    "B4": "blackman-harris-4",
+    "NBW": "norton-beer-weak",
+    "NBM": "norton-beer-medium",
+    "NBS": "norton-beer-strong",
 }
 PHASE_CORRECTION = {"ML": "mertz", "PW": "power", "FM": "forman", "NO": "none"}
-PER_CM = 100.0                # m-1
+PER_CM = 100.0  # m-1
 
 
 def read_opus(path: Path, channel: Channel = "sample") -> Bench:
@@ -52,7 +59,9 @@ def read_opus(path: Path, channel: Channel = "sample") -> Bench:
     if series is None:
         found = ", ".join(data.all_data_keys) or "nothing"
         raise InputError(
-            path, f"block '{interferogram}'", f"there is no {channel} interferogram (the file holds {found})",
+            path,
+            f"block '{interferogram}'",
+            f"there is no {channel} interferogram (the file holds {found})",
             "have OPUS save interferograms with the spectra",
         )
     scans = _scans(np.asarray(series.y, np.float64), parameters, path)
@@ -68,8 +77,12 @@ def read_opus(path: Path, channel: Channel = "sample") -> Bench:
         wavenumber, reference = _spectrum(getattr(data, spectrum), path)
     zero_filling, resolution, phase = (_optional(parameters, key) for key in ("zff", "res", "phr"))
     return Bench(
-        scans, opd, wavenumber, reference,
-        _code(parameters, "apf", APODIZATION), _code(parameters, "phz", PHASE_CORRECTION),
+        scans,
+        opd,
+        wavenumber,
+        reference,
+        _code(parameters, "apf", APODIZATION),
+        _code(parameters, "phz", PHASE_CORRECTION),
         None if zero_filling is None else int(zero_filling),
         None if resolution is None else resolution * PER_CM,
         None if phase is None else phase * PER_CM,
@@ -87,7 +100,7 @@ def _open(path: Path) -> Any:
         raise InputError(path, "file", "does not exist", "correct the name")
     try:
         data = read(str(path))
-    except Exception as error:      # a third party's parser: whatever it raises, the file's bytes are the cause
+    except Exception as error:  # a third party's parser: whatever it raises, the file's bytes are the cause
         raise InputError(
             path, "file", f"is a damaged OPUS file ({type(error).__name__})", "it may be truncated: copy it again"
         ) from error
@@ -121,7 +134,9 @@ def _spectrum(block: Any, path: Path) -> tuple[Array, Array]:
     """Wavenumber [m-1], increasing, and the vendor's spectrum."""
     if str(getattr(block.params, "dxu", "WN")) != "WN":
         raise InputError(
-            path, "spectrum", f"is against '{block.params.dxu}', not wavenumber",
+            path,
+            "spectrum",
+            f"is against '{block.params.dxu}', not wavenumber",
             "have OPUS store it against wavenumber",
         )
     wavenumber, values = np.asarray(block.x, np.float64) * PER_CM, np.asarray(block.y, np.float64)
@@ -150,7 +165,9 @@ def _number(parameters: Any, key: str, path: Path) -> float:
     value = _optional(parameters, key)
     if value is None or not value > 0.0:
         raise InputError(
-            path, f"parameter {key.upper()}", "is missing or not positive",
+            path,
+            f"parameter {key.upper()}",
+            "is missing or not positive",
             "the sampling is unknown without it: export the file again",
         )
     return value

@@ -41,12 +41,23 @@ Records = NDArray[Any]
 
 # Field and the largest magnitude that is believed: far outside any aircraft, far inside what other bytes look like.
 LIMITS = {
-    "time": 1e10,                                                                         # s
-    "latitude": np.pi / 2, "longitude": 2 * np.pi, "height": 1e6,                         # rad, rad, m
-    "velocity_x": 1e4, "velocity_y": 1e4, "velocity_z": 1e4,                              # m/s
-    "roll": 2 * np.pi, "pitch": np.pi, "platform_heading": 4 * np.pi, "wander": 4 * np.pi,    # rad
-    "acceleration_x": 1e4, "acceleration_y": 1e4, "acceleration_z": 1e4,                  # m/s²
-    "rate_x": 1e3, "rate_y": 1e3, "rate_z": 1e3,                                          # rad/s
+    "time": 1e10,  # s
+    "latitude": np.pi / 2,
+    "longitude": 2 * np.pi,
+    "height": 1e6,  # rad, rad, m
+    "velocity_x": 1e4,
+    "velocity_y": 1e4,
+    "velocity_z": 1e4,  # m/s
+    "roll": 2 * np.pi,
+    "pitch": np.pi,
+    "platform_heading": 4 * np.pi,
+    "wander": 4 * np.pi,  # rad
+    "acceleration_x": 1e4,
+    "acceleration_y": 1e4,
+    "acceleration_z": 1e4,  # m/s²
+    "rate_x": 1e3,
+    "rate_y": 1e3,
+    "rate_z": 1e3,  # rad/s
 }
 DTYPE = np.dtype([(name, "<f8") for name in LIMITS])
 
@@ -64,23 +75,29 @@ def read_sbet(path: Path) -> Records:
         raise InputError(path, "file", "is empty", f"an SBET has {size} bytes a record")
     if len(content) % size:
         raise InputError(
-            path, f"record {len(content) // size}", f"is cut: {len(content)} bytes are no multiple of {size}",
+            path,
+            f"record {len(content) // size}",
+            f"is cut: {len(content)} bytes are no multiple of {size}",
             "the file is truncated or no SBET: copy it again",
         )
     records = np.frombuffer(content, DTYPE).copy()
     for name, limit in LIMITS.items():
-        bad = ~(np.abs(records[name]) <= limit)                     # catches NaN as well
+        bad = ~(np.abs(records[name]) <= limit)  # catches NaN as well
         if bad.any():
             i = int(np.argmax(bad))
             raise InputError(
-                path, f"record {i}, {name}", f"is {records[name][i]:.6g}, beyond ±{limit:.6g}",
+                path,
+                f"record {i}, {name}",
+                f"is {records[name][i]:.6g}, beyond ±{limit:.6g}",
                 "the file is no little-endian SBET of 17 doubles, or damaged there",
             )
     backwards = np.diff(records["time"]) <= 0
     if backwards.any():
         i = int(np.argmax(backwards)) + 1
         raise InputError(
-            path, f"record {i}, time", f"is {records['time'][i]:.6f} s after {records['time'][i - 1]:.6f} s",
+            path,
+            f"record {i}, time",
+            f"is {records['time'][i]:.6f} s after {records['time'][i - 1]:.6f} s",
             "time must increase: sort the records, and unwrap seconds of week",
         )
     return records
@@ -117,8 +134,19 @@ def from_trajectory(trajectory: Trajectory) -> Records:
     acceleration = t.specific_force + np.einsum("nji,nj->ni", to_ned, gravity)
     rate = t.rate - np.einsum("nji,nj->ni", to_ned, earth_rate_ned(t.latitude) + transport)
     columns = (
-        t.time, t.latitude, t.longitude, t.height, north, -east, -down, roll, pitch, yaw, np.zeros_like(yaw),
-        *acceleration.T, *rate.T,
+        t.time,
+        t.latitude,
+        t.longitude,
+        t.height,
+        north,
+        -east,
+        -down,
+        roll,
+        pitch,
+        yaw,
+        np.zeros_like(yaw),
+        *acceleration.T,
+        *rate.T,
     )
     records = np.empty(t.time.size, DTYPE)
     for name, column in zip(LIMITS, columns, strict=True):
@@ -129,9 +157,7 @@ def from_trajectory(trajectory: Trajectory) -> Records:
 def velocity_ned(records: Records) -> Array:
     """vN = vx·cos w − vy·sin w, vE = −(vx·sin w + vy·cos w), vD = −vz; (n,) → (n, 3) [m/s]."""
     vx, vy, vz, wander = (records[name] for name in ("velocity_x", "velocity_y", "velocity_z", "wander"))
-    return np.stack(
-        [vx * np.cos(wander) - vy * np.sin(wander), -(vx * np.sin(wander) + vy * np.cos(wander)), -vz], -1
-    )
+    return np.stack([vx * np.cos(wander) - vy * np.sin(wander), -(vx * np.sin(wander) + vy * np.cos(wander)), -vz], -1)
 
 
 def heading(records: Records) -> Array:

@@ -26,8 +26,12 @@ MOST_POINTS = 1500
 def layout(figure: go.Figure, height: int, title: str | None = None) -> go.Figure:
     """The report's one style."""
     figure.update_layout(
-        template="plotly_white", height=height, margin={"l": 70, "r": 25, "t": 50 if title else 40, "b": 55}, title=title,
-        font={"family": "system-ui, sans-serif", "size": 13}, legend={"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 1.0, "xanchor": "right"},
+        template="plotly_white",
+        height=height,
+        margin={"l": 70, "r": 25, "t": 50 if title else 40, "b": 55},
+        title=title,
+        font={"family": "system-ui, sans-serif", "size": 13},
+        legend={"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0.0, "xanchor": "left"},
     )
     return figure
 
@@ -38,9 +42,15 @@ def thin(*series: Array) -> list[list[float]]:
     return [np.round(np.asarray(s, float)[::step], 9).tolist() for s in series]
 
 
-def trajectory_map(trajectory: Trajectory, lines: dict[str, tuple[float, float]], targets: dict[str, Targets]) -> go.Figure:
+def trajectory_map(
+    trajectory: Trajectory, lines: dict[str, tuple[float, float]], targets: dict[str, Targets]
+) -> go.Figure:
     """Plan view in metres about the flight's middle, its lines and targets."""
-    origin = float(np.median(trajectory.latitude)), float(np.median(trajectory.longitude)), float(np.median(trajectory.height))
+    origin = (
+        float(np.median(trajectory.latitude)),
+        float(np.median(trajectory.longitude)),
+        float(np.median(trajectory.height)),
+    )
     ned = local_metres(trajectory.latitude, trajectory.longitude, trajectory.height, *origin)
     figure = go.Figure()
     north, east = thin(ned[:, 0], ned[:, 1])
@@ -52,7 +62,11 @@ def trajectory_map(trajectory: Trajectory, lines: dict[str, tuple[float, float]]
     for name, t in targets.items():
         at = local_metres(t.latitude, t.longitude, t.height, *origin)
         figure.add_scatter(
-            x=at[:, 1].tolist(), y=at[:, 0].tolist(), mode="markers", name=f"targets {name}", text=list(t.ids),
+            x=at[:, 1].tolist(),
+            y=at[:, 0].tolist(),
+            mode="markers",
+            name=f"targets {name}",
+            text=list(t.ids),
             marker={"symbol": "square", "size": 7, "color": "#111"},
         )
     figure.update_xaxes(title="east [m]")
@@ -67,31 +81,51 @@ def attitude(trajectory: Trajectory, lines: dict[str, tuple[float, float]]) -> g
     rpy = np.rad2deg(trajectory.rpy)
     heading = np.rad2deg(np.unwrap(trajectory.rpy[:, 2]))
     figure = make_subplots(rows=5, cols=1, shared_xaxes=True, vertical_spacing=0.03)
-    for i, (name, values) in enumerate(zip(names, (trajectory.height, speed, rpy[:, 0], rpy[:, 1], heading), strict=True), start=1):
+    for i, (name, values) in enumerate(
+        zip(names, (trajectory.height, speed, rpy[:, 0], rpy[:, 1], heading), strict=True), start=1
+    ):
         time, y = thin(trajectory.time, values)
-        figure.add_scatter(x=time, y=y, mode="lines", line={"color": COLOURS["tracking"], "width": 1}, showlegend=False, row=i, col=1)
+        figure.add_scatter(
+            x=time, y=y, mode="lines", line={"color": COLOURS["tracking"], "width": 1}, showlegend=False, row=i, col=1
+        )
         figure.update_yaxes(title=name, row=i, col=1)
     _shade(figure, lines)
     figure.update_xaxes(title="time [s after the epoch]", row=5, col=1)
     return layout(figure, 760)
 
 
-def navigation_quality(trajectory: Trajectory, figures: dict[str, list[float]], lines: dict[str, tuple[float, float]]) -> go.Figure:
+def navigation_quality(
+    trajectory: Trajectory, figures: dict[str, list[float]], lines: dict[str, tuple[float, float]]
+) -> go.Figure:
     """Formal sigmas of position and attitude, fix residuals, and the innovations' NIS."""
     figure = make_subplots(rows=4, cols=1, shared_xaxes=True, vertical_spacing=0.04)
     palette = ("#0b63b0", "#e07b00", "#3a9a4d")
     for i, name in enumerate(("north", "east", "down")):
         time, y = thin(trajectory.time, trajectory.sigma_position[:, i])
-        figure.add_scatter(x=time, y=y, name=name, legendgroup=name, line={"color": palette[i], "width": 1.2}, row=1, col=1)
+        figure.add_scatter(
+            x=time, y=y, name=name, legendgroup=name, line={"color": palette[i], "width": 1.2}, row=1, col=1
+        )
         time, y = thin(np.array(figures["residual_time"]), np.array(figures[f"residual_{name}"]))
         figure.add_scatter(
-            x=time, y=y, mode="markers", name=name, legendgroup=name, showlegend=False, marker={"color": palette[i], "size": 3}, row=3, col=1,
+            x=time,
+            y=y,
+            mode="markers",
+            name=name,
+            legendgroup=name,
+            showlegend=False,
+            marker={"color": palette[i], "size": 3},
+            row=3,
+            col=1,
         )
     for i, name in enumerate(("roll", "pitch", "yaw")):
         time, y = thin(trajectory.time, np.rad2deg(trajectory.sigma_attitude[:, i]))
-        figure.add_scatter(x=time, y=y, name=name, line={"color": palette[i], "width": 1.2, "dash": "dash"}, row=2, col=1)
+        figure.add_scatter(
+            x=time, y=y, name=name, line={"color": palette[i], "width": 1.2, "dash": "dash"}, row=2, col=1
+        )
     time, y = thin(np.array(figures["fix_time"]), np.array(figures["fix_nis"]))
-    figure.add_scatter(x=time, y=y, mode="markers", name="NIS", showlegend=False, marker={"color": "#555", "size": 3}, row=4, col=1)
+    figure.add_scatter(
+        x=time, y=y, mode="markers", name="NIS", showlegend=False, marker={"color": "#555", "size": 3}, row=4, col=1
+    )
     for row, name in enumerate(("σ position [m]", "σ attitude [°]", "fix − path [m]", "NIS of fixes [1]"), start=1):
         figure.update_yaxes(title=name, row=row, col=1)
     _shade(figure, lines)
@@ -120,18 +154,39 @@ def thermal(runs: list[dict[str, Any]], sensor: str) -> go.Figure:
         hours = (np.asarray(run["time_s"]) - run["time_s"][0]) / 3600.0 + offset
         offset = float(hours[-1]) + 0.2
         temperature = np.asarray(run["temperature_degc"])[:, first : first + 3].mean(axis=1)
-        figure.add_scatter(x=hours.tolist(), y=temperature.tolist(), showlegend=False, line={"color": "#c0392b", "width": 1.2}, row=1, col=1)
+        figure.add_scatter(
+            x=hours.tolist(),
+            y=temperature.tolist(),
+            showlegend=False,
+            line={"color": "#c0392b", "width": 1.2},
+            row=1,
+            col=1,
+        )
         for axis in range(3):
             band = 1.96 * scale * np.asarray(run["sigma"])[:, first + axis]
             figure.add_scatter(
-                x=np.concatenate([hours, hours[::-1]]).tolist(), y=np.concatenate([band, -band[::-1]]).tolist(), fill="toself", mode="none",
-                fillcolor="rgba(11,99,176,0.18)", name="95 % by the model", legendgroup="band", showlegend=r == 0 and axis == 0, row=axis + 2, col=1,
+                x=np.concatenate([hours, hours[::-1]]).tolist(),
+                y=np.concatenate([band, -band[::-1]]).tolist(),
+                fill="toself",
+                mode="none",
+                fillcolor="rgba(11,99,176,0.18)",
+                name="95 % by the model",
+                legendgroup="band",
+                showlegend=r == 0 and axis == 0,
+                row=axis + 2,
+                col=1,
             )
             for name in ("raw", "rbf", "bayesian_rbf"):
                 values = np.asarray(run["raw"] if name == "raw" else run["left"][name])[:, first + axis]
                 figure.add_scatter(
-                    x=hours.tolist(), y=(scale * (values - values.mean())).tolist(), name=name.replace("_", " "), legendgroup=name,
-                    showlegend=r == 0 and axis == 0, line={"color": SENSOR[name], "width": 1.2}, row=axis + 2, col=1,
+                    x=hours.tolist(),
+                    y=(scale * (values - values.mean())).tolist(),
+                    name=name.replace("_", " "),
+                    legendgroup=name,
+                    showlegend=r == 0 and axis == 0,
+                    line={"color": SENSOR[name], "width": 1.2},
+                    row=axis + 2,
+                    col=1,
                 )
     figure.update_yaxes(title="T [°C]", row=1, col=1)
     for axis in range(3):
@@ -151,7 +206,17 @@ def tracks_over_frame(frames: Frames, tracks: Tracks) -> go.Figure:
     rows, cols = image.shape
     figure = go.Figure()
     figure.add_layout_image(
-        source=_png(image), xref="x", yref="y", x=-0.5, y=-0.5, sizex=cols, sizey=rows, sizing="stretch", layer="below", xanchor="left", yanchor="top",
+        source=_png(image),
+        xref="x",
+        yref="y",
+        x=-0.5,
+        y=-0.5,
+        sizex=cols,
+        sizey=rows,
+        sizing="stretch",
+        layer="below",
+        xanchor="left",
+        yanchor="top",
     )
     for m, method in enumerate(tracks.methods):
         x: list[float | None] = []
@@ -167,10 +232,21 @@ def tracks_over_frame(frames: Frames, tracks: Tracks) -> go.Figure:
         row, col = tracks.row[m, t, Tracks.CENTRE, middle], tracks.col[m, t, Tracks.CENTRE, middle]
         if np.isfinite(row) and -0.5 <= row <= rows - 0.5 and -0.5 <= col <= cols - 0.5:
             figure.add_scatter(
-                x=[float(col)], y=[float(row)], mode="markers+text", text=[name], textposition="top center", showlegend=False,
-                marker={"symbol": "cross-thin", "size": 12, "line": {"color": "#d81b60", "width": 2}}, textfont={"color": "#d81b60"},
+                x=[float(col)],
+                y=[float(row)],
+                mode="markers+text",
+                text=[name],
+                textposition="top center",
+                showlegend=False,
+                marker={"symbol": "cross-thin", "size": 12, "line": {"color": "#d81b60", "width": 2}},
+                textfont={"color": "#d81b60"},
             )
-    figure.update_xaxes(title="column [px] (optical path difference runs along columns)", range=[-0.5, cols - 0.5], constrain="domain", showgrid=False)
+    figure.update_xaxes(
+        title="column [px] (optical path difference runs along columns)",
+        range=[-0.5, cols - 0.5],
+        constrain="domain",
+        showgrid=False,
+    )
     figure.update_yaxes(title="row [px]", range=[rows - 0.5, -0.5], scaleanchor="x", showgrid=False)
     return layout(figure, 560)
 
@@ -180,7 +256,9 @@ def spectra(record: Spectra, area: bool) -> go.Figure:
     names = record.targets
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
-    figure = make_subplots(rows=rows, cols=columns, subplot_titles=list(names), vertical_spacing=0.28 / rows, horizontal_spacing=0.06)
+    figure = make_subplots(
+        rows=rows, cols=columns, subplot_titles=list(names), vertical_spacing=0.28 / rows, horizontal_spacing=0.06
+    )
     value = record.radiance_area if area else record.radiance
     sigma = record.sigma_radiance_area if area else record.sigma_radiance
     wavelength = 1e9 / record.wavenumber
@@ -188,8 +266,13 @@ def spectra(record: Spectra, area: bool) -> go.Figure:
         at = {"row": t // columns + 1, "col": t % columns + 1}
         if np.isfinite(record.reference[t]).all():
             figure.add_scatter(
-                x=wavelength.tolist(), y=record.reference[t].tolist(), name="reference", legendgroup="reference", showlegend=t == 0,
-                line={"color": COLOURS["reference"], "width": 2, "dash": "dot"}, **at,
+                x=wavelength.tolist(),
+                y=record.reference[t].tolist(),
+                name="reference",
+                legendgroup="reference",
+                showlegend=t == 0,
+                line={"color": COLOURS["reference"], "width": 2, "dash": "dot"},
+                **at,
             )
         for m, method in enumerate(record.methods):
             y, s = value[m, t], 1.96 * sigma[m, t]
@@ -197,10 +280,25 @@ def spectra(record: Spectra, area: bool) -> go.Figure:
                 continue
             if method == "tracking":
                 figure.add_scatter(
-                    x=np.concatenate([wavelength, wavelength[::-1]]).tolist(), y=np.concatenate([y + s, (y - s)[::-1]]).tolist(),
-                    fill="toself", mode="none", fillcolor="rgba(11,99,176,0.2)", name="95 % (tracking)", legendgroup="band", showlegend=t == 0, **at,
+                    x=np.concatenate([wavelength, wavelength[::-1]]).tolist(),
+                    y=np.concatenate([y + s, (y - s)[::-1]]).tolist(),
+                    fill="toself",
+                    mode="none",
+                    fillcolor="rgba(11,99,176,0.2)",
+                    name="95 % (tracking)",
+                    legendgroup="band",
+                    showlegend=t == 0,
+                    **at,
                 )
-            figure.add_scatter(x=wavelength.tolist(), y=y.tolist(), name=method, legendgroup=method, showlegend=t == 0, line={"color": COLOURS.get(method), "width": 1.3}, **at)
+            figure.add_scatter(
+                x=wavelength.tolist(),
+                y=y.tolist(),
+                name=method,
+                legendgroup=method,
+                showlegend=t == 0,
+                line={"color": COLOURS.get(method), "width": 1.3},
+                **at,
+            )
         figure.update_xaxes(title="wavelength [nm]" if t // columns == rows - 1 else None, **at)
         figure.update_yaxes(title="radiance [ref. unit]" if t % columns == 0 else None, **at)
     layout(figure, 90 + 260 * rows)
@@ -213,8 +311,12 @@ def interferogram(record: Interferograms, opd: Array, target: int) -> go.Figure:
     figure = make_subplots(rows=len(record.methods), cols=1, shared_xaxes=True, vertical_spacing=0.05)
     for m, method in enumerate(record.methods):
         figure.add_scatter(
-            x=(opd * 1e6).tolist(), y=np.round(record.value[m, target, Tracks.CENTRE], 2).tolist(), name=method,
-            line={"color": COLOURS.get(method), "width": 1.2}, row=m + 1, col=1,
+            x=(opd * 1e6).tolist(),
+            y=np.round(record.value[m, target, Tracks.CENTRE], 2).tolist(),
+            name=method,
+            line={"color": COLOURS.get(method), "width": 1.2},
+            row=m + 1,
+            col=1,
         )
         figure.update_yaxes(title="signal [DN]", row=m + 1, col=1)
     figure.update_xaxes(title="optical path difference [µm]", row=len(record.methods), col=1)
@@ -223,16 +325,31 @@ def interferogram(record: Interferograms, opd: Array, target: int) -> go.Figure:
 
 def bench(wavenumber: Array, spectrum: Array, reference: Array | None) -> go.Figure:
     """A laboratory spectrum over the vendor's, and their difference."""
-    figure = make_subplots(rows=2 if reference is not None else 1, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.7, 0.3] if reference is not None else [1.0])
+    figure = make_subplots(
+        rows=2 if reference is not None else 1,
+        cols=1,
+        shared_xaxes=True,
+        vertical_spacing=0.06,
+        row_heights=[0.7, 0.3] if reference is not None else [1.0],
+    )
     cm, ours = thin(wavenumber / 100.0, spectrum)
     if reference is not None:
         _, theirs = thin(wavenumber, reference)
-        figure.add_scatter(x=cm, y=theirs, name="reference", line={"color": COLOURS["reference"], "width": 3, "dash": "dot"}, row=1, col=1)
+        figure.add_scatter(
+            x=cm,
+            y=theirs,
+            name="reference",
+            line={"color": COLOURS["reference"], "width": 3, "dash": "dot"},
+            row=1,
+            col=1,
+        )
         scale = float(np.linalg.norm(reference)) / np.sqrt(reference.size)
         _, left = thin(wavenumber, (spectrum - reference) / scale)
         figure.add_scatter(x=cm, y=left, name="difference", line={"color": "#c0392b", "width": 1}, row=2, col=1)
         figure.update_yaxes(title="difference / RMS [1]", row=2, col=1)
-    figure.add_scatter(x=cm, y=ours, name="reconstructed", line={"color": COLOURS["tracking"], "width": 1.2}, row=1, col=1)
+    figure.add_scatter(
+        x=cm, y=ours, name="reconstructed", line={"color": COLOURS["tracking"], "width": 1.2}, row=1, col=1
+    )
     figure.update_yaxes(title="single-channel signal [counts]", row=1, col=1)
     figure.update_xaxes(title="wavenumber [cm⁻¹]", autorange="reversed", row=2 if reference is not None else 1, col=1)
     return layout(figure, 520)

@@ -28,20 +28,31 @@ class _Figures:
 
     def html(self, figure: go.Figure) -> Markup:
         self.count += 1
-        return Markup(figure.to_html(
-            full_html=False, include_plotlyjs=False, div_id=f"figure-{self.count}", config={"displaylogo": False, "responsive": True},
-        ))
+        return Markup(
+            figure.to_html(
+                full_html=False,
+                include_plotlyjs=False,
+                div_id=f"figure-{self.count}",
+                config={"displaylogo": False, "responsive": True},
+            )
+        )
 
 
-def write_report(campaign: Campaign, out: Path, run: dict[str, Any], settings: dict[str, Any], warnings: list[str]) -> Path:
+def write_report(
+    campaign: Campaign, out: Path, run: dict[str, Any], settings: dict[str, Any], warnings: list[str]
+) -> Path:
     """Write `out`/report.html for what `run` (the content of run.json) lists; returns its path."""
     draw = _Figures()
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters["figure"] = _significant
     template = environment.from_string(files("pipeline.report").joinpath("page.html").read_text(encoding="utf-8"))
     content = template.render(
-        run=run, settings=json.dumps(settings, indent=1, sort_keys=True), warnings=warnings, plotly=Markup(get_plotlyjs()),
-        thermal=_thermal(out, run, draw), flights=[_flight(campaign, out, f, run, draw) for f in run["flights"]],
+        run=run,
+        settings=json.dumps(settings, indent=1, sort_keys=True),
+        warnings=warnings,
+        plotly=Markup(get_plotlyjs()),
+        thermal=_thermal(out, run, draw),
+        flights=[_flight(campaign, out, f, run, draw) for f in run["flights"]],
         bench=[_bench(out, b, run, draw) for b in run["bench"]],
         style=Markup(files("pipeline.report").joinpath("page.css").read_text(encoding="utf-8")),
     )
@@ -64,12 +75,21 @@ def _thermal(out: Path, run: dict[str, Any], draw: _Figures) -> dict[str, Any] |
     if not run.get("thermal") or not path.exists():
         return None
     runs = json.loads(path.read_text(encoding="utf-8"))["verify"]
-    shown = {"gyro": draw.html(figures.thermal(runs, "gyro")), "accel": draw.html(figures.thermal(runs, "accel"))} if runs else {}
+    shown = (
+        {"gyro": draw.html(figures.thermal(runs, "gyro")), "accel": draw.html(figures.thermal(runs, "accel"))}
+        if runs
+        else {}
+    )
     return {"figures": shown, "verify": run["thermal"]["verify"], "notes": run["thermal"].get("notes", [])}
 
 
 def _flight(campaign: Campaign, out: Path, flight: str, run: dict[str, Any], draw: _Figures) -> dict[str, Any]:
-    entry: dict[str, Any] = {"id": flight, "navigation": run["flights"][flight].get("navigation"), "figures": {}, "lines": []}
+    entry: dict[str, Any] = {
+        "id": flight,
+        "navigation": run["flights"][flight].get("navigation"),
+        "figures": {},
+        "lines": [],
+    }
     path = out / flight / "trajectory.nc"
     lines = [line.id for line in campaign.flight(flight).lines if line.id in run["flights"][flight]["lines"]]
     if path.exists():
@@ -89,9 +109,18 @@ def _flight(campaign: Campaign, out: Path, flight: str, run: dict[str, Any], dra
     return entry
 
 
-def _line(campaign: Campaign, out: Path, flight: str, line: str, scores: dict[str, Any], draw: _Figures) -> dict[str, Any]:
+def _line(
+    campaign: Campaign, out: Path, flight: str, line: str, scores: dict[str, Any], draw: _Figures
+) -> dict[str, Any]:
     folder = out / flight / line
-    entry: dict[str, Any] = {"id": line, "scores": scores, "figures": {}, "quicklook": None, "targets": [], "methods": []}
+    entry: dict[str, Any] = {
+        "id": line,
+        "scores": scores,
+        "figures": {},
+        "quicklook": None,
+        "targets": [],
+        "methods": [],
+    }
     if (folder / "tracks.nc").exists():
         tracks = Tracks.from_file(folder / "tracks.nc")
         entry["figures"]["tracks"] = draw.html(figures.tracks_over_frame(campaign.frames(flight, line), tracks))

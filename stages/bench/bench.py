@@ -35,15 +35,15 @@ Complex = NDArray[np.complex128]
 
 PhaseCorrection = Literal["mertz", "power"]
 
-OPUS_UNIT = 1_579_800.0 / 8.0       # m-1, see above
-WINDOW_REACH = 0.9                  # L·resolution
-TWO_SIDED = 0.9                     # without a resolution, sides that differ less than this are cut to the shorter
-PHASE_SHARE = 1.0 / 8.0             # L of the phase over that of the spectrum where no phase resolution is known
+OPUS_UNIT = 1_579_800.0 / 8.0  # m-1, see above
+WINDOW_REACH = 0.9  # L·resolution
+TWO_SIDED = 0.9  # without a resolution, sides that differ less than this are cut to the shorter
+PHASE_SHARE = 1.0 / 8.0  # L of the phase over that of the spectrum where no phase resolution is known
 # Whatever the spectrum's window: one with strong side lobes (boxcar) turns the phase by π where they are negative.
 PHASE_WINDOW = "blackman-harris-3"
-SHORTEST_SIDE = 8                   # samples about ZPD, below which there is no phase to speak of
-BLOCK = 64                          # wavenumbers transformed at once
-ELEMENTS = 2_000_000                # of a table in memory at once
+SHORTEST_SIDE = 8  # samples about ZPD, below which there is no phase to speak of
+BLOCK = 64  # wavenumbers transformed at once
+ELEMENTS = 2_000_000  # of a table in memory at once
 
 
 class BenchSettings(BaseModel):
@@ -106,8 +106,12 @@ class BenchResult:
         if self.reference is not None:
             variables["reference"] = (("wavenumber",), self.reference, {"long_name": "the spectrum in the bench file"})
         attributes: dict[str, str | float | int] = {
-            "apodization": p.apodization, "phase_correction": p.phase_correction, "zero_filling": p.zero_filling,
-            "half_length_m": p.half_length, "phase_half_length_m": p.phase_half_length, "notes": "; ".join(self.notes),
+            "apodization": p.apodization,
+            "phase_correction": p.phase_correction,
+            "zero_filling": p.zero_filling,
+            "half_length_m": p.half_length,
+            "phase_half_length_m": p.phase_half_length,
+            "notes": "; ".join(self.notes),
         }
         if p.ramp is not None:
             attributes["mertz_ramp_m"] = p.ramp
@@ -137,7 +141,8 @@ def run(bench: Bench, settings: BenchSettings) -> BenchResult:
         return result
     scale = float(spectrum @ reference / (spectrum @ spectrum))
     return replace(
-        result, scale=scale,
+        result,
+        scale=scale,
         relative_rms=float(fourier.rqe(spectrum, reference)),
         relative_rms_scaled=float(fourier.rqe(scale * spectrum, reference)),
     )
@@ -150,7 +155,8 @@ def find_zpd(scans: Array, opd: Array) -> Array:
     if nearest.min() < SHORTEST_SIDE:
         worst = int(np.argmin(nearest))
         raise InputError(
-            "bench", f"interferogram, scan {worst}",
+            "bench",
+            f"interferogram, scan {worst}",
             f"its largest deviation is sample {index[worst]} of {opd.size}: nothing of the burst's other side is there",
             "record at least some samples on both sides of zero path difference",
         )
@@ -166,7 +172,9 @@ def choose(bench: Bench, settings: BenchSettings, zpd: Array) -> tuple[Parameter
         notes.append(f"no apodization is given: {apodization}")
     elif apodization not in fourier.APODIZATIONS:
         raise InputError(
-            "bench", "attribute 'apodization'", f"'{apodization}' is not known",
+            "bench",
+            "attribute 'apodization'",
+            f"'{apodization}' is not known",
             f"override bench.apodization with one of {', '.join(fourier.APODIZATIONS)}",
         )
     zero_filling = settings.zero_filling or bench.zero_filling
@@ -204,7 +212,9 @@ def _phase_correction(name: str | None, notes: list[str]) -> PhaseCorrection:
         notes.append("no phase correction is given: mertz")
         return "mertz"
     raise InputError(
-        "bench", "attribute 'phase_correction'", f"'{name}' is not known",
+        "bench",
+        "attribute 'phase_correction'",
+        f"'{name}' is not known",
         "override bench.phase_correction with mertz or power",
     )
 
@@ -225,7 +235,8 @@ def _half_length(
         return half
     if wanted is not None:
         raise InputError(
-            "bench", f"setting bench.{name}_per_m",
+            "bench",
+            f"setting bench.{name}_per_m",
             f"{wanted:g} m-1 needs {half:.4g} m of OPD, the interferogram has {longest:.4g} m",
             f"use {1.00001 * WINDOW_REACH / longest:.6g} m-1 or more",
         )
@@ -237,7 +248,7 @@ def grid(opd: Array, parameters: Parameters) -> Array:
     """Wavenumbers [m-1], 0 to 1/(2·dx) by 1/(N·dx); N = zero filling × the power of two that holds L/dx."""
     step = float(np.diff(opd).mean())
     samples = parameters.zero_filling * 2 ** int(np.ceil(np.log2(parameters.half_length / step)))
-    nyquist = 0.5 / float(np.diff(opd).max())           # of the widest interval: beyond it the spectrum folds
+    nyquist = 0.5 / float(np.diff(opd).max())  # of the widest interval: beyond it the spectrum folds
     return np.arange(int(nyquist * samples * step * (1.0 + 1e-9)) + 1) / (samples * step)
 
 
@@ -247,7 +258,7 @@ def corrected(scans: Array, opd: Array, zpd: Array, wavenumber: Array, parameter
     x = opd - zpd[:, None]
     window = fourier.apodization(p.apodization, x / p.half_length)
     if p.ramp is not None:
-        ramp = p.ramp                                    # w(x) + w(−x) = 2, as without a ramp
+        ramp = p.ramp  # w(x) + w(−x) = 2, as without a ramp
         window = window * np.stack([2.0 * fourier.mertz_ramp(one, ramp) for one in x])
     spectrum = transform(scans * window, opd, wavenumber)
     if p.phase_correction == "power":
@@ -266,7 +277,7 @@ def transform(windowed: Array, opd: Array, wavenumber: Array) -> Complex:
     used = np.flatnonzero(np.any(windowed != 0.0, axis=0))
     if used.size == 0:
         return np.zeros((len(windowed), wavenumber.size), complex)
-    inside = slice(max(int(used[0]) - 1, 0), int(used[-1]) + 2)      # a zero more each side keeps the ends' dx whole
+    inside = slice(max(int(used[0]) - 1, 0), int(used[-1]) + 2)  # a zero more each side keeps the ends' dx whole
     x, y = opd[inside], windowed[:, inside]
     ones = np.ones(x.size)
     even = np.linspace(wavenumber[0], wavenumber[-1], wavenumber.size)

@@ -24,9 +24,9 @@ from tsmftis.interferometer import Interferometer
 Array = NDArray[np.float64]
 Heights = Callable[[Array, Array], Array]
 
-LEAST_SEEN = 0.97           # of the columns, for a cell to have a spectrum: the score's own rule
-EDGE_CELLS = 12             # kept beyond the ends of what the plane says is seen
-MOST_CELLS = 200_000_000    # a grid larger than this means poses that are wrong
+LEAST_SEEN = 0.97  # of the columns, for a cell to have a spectrum: the score's own rule
+EDGE_CELLS = 12  # kept beyond the ends of what the plane says is seen
+MOST_CELLS = 200_000_000  # a grid larger than this means poses that are wrong
 
 
 class MappingSettings(BaseModel):
@@ -47,7 +47,7 @@ class MapGrid:
 
     crs: str
     origin: tuple[float, float]
-    course: float               # grid angle of `along`, from the CRS's north over east [rad]
+    course: float  # grid angle of `along`, from the CRS's north over east [rad]
     cell: float
     shape: tuple[int, int]
     ground_height: float
@@ -78,7 +78,10 @@ def line_grid(poses: CameraPoses, camera: Camera, ground_height: float, settings
     if (height <= ground_height).any():
         raise StageError("the camera lies below the terrain: heights of DEM or targets do not fit the trajectory")
     crs = settings.crs or utm_crs(float(latitude.mean()), float(longitude.mean()))
-    rows, cols = np.array([0.0, 0.0, camera.rows - 1.0, camera.rows - 1.0]), np.array([0.0, camera.cols - 1.0, 0.0, camera.cols - 1.0])
+    rows, cols = (
+        np.array([0.0, 0.0, camera.rows - 1.0, camera.rows - 1.0]),
+        np.array([0.0, camera.cols - 1.0, 0.0, camera.cols - 1.0]),
+    )
     rays = np.einsum("fij,pj->fpi", dcm, camera.directions(rows, cols))
     foot_lat, foot_lon = _on_plane(centre[:, None, :], rays, ground_height)
     x, y = to_crs(crs, foot_lat, foot_lon)
@@ -95,7 +98,9 @@ def line_grid(poses: CameraPoses, camera: Camera, ground_height: float, settings
     low = first, across.min()
     shape = int(np.ceil((last - first) / cell)), int(np.ceil((across.max() - low[1]) / cell))
     if not 0 < shape[0] * shape[1] < MOST_CELLS:
-        raise StageError(f"the line's footprint would need {shape[0]} × {shape[1]} cells: the attitude is not that of a camera looking down")
+        raise StageError(
+            f"the line's footprint would need {shape[0]} × {shape[1]} cells: the attitude is not that of a camera looking down"
+        )
     origin = (
         low[0] * np.sin(course) + low[1] * np.cos(course),
         low[0] * np.cos(course) - low[1] * np.sin(course),
@@ -132,11 +137,25 @@ def run(
         if last - first >= 2:
             value, gain, weight, row = (np.zeros((len(points), camera.cols)) for _ in range(4))
             block = detector.correct(
-                frames.block(first, last), calibration.dark, calibration.flat, camera.saturation, interferometer.detector_nonlinearity
+                frames.block(first, last),
+                calibration.dark,
+                calibration.flat,
+                camera.saturation,
+                interferometer.detector_nonlinearity,
             )
             extraction.over_cells(
-                block, points, centre[first:last], dcm[first:last], camera.focal_length / camera.pixel_pitch,
-                camera.principal_row, camera.principal_col, camera.radial_k1, value, gain, weight, row,
+                block,
+                points,
+                centre[first:last],
+                dcm[first:last],
+                camera.focal_length / camera.pixel_pitch,
+                camera.principal_row,
+                camera.principal_col,
+                camera.radial_k1,
+                value,
+                gain,
+                weight,
+                row,
             )
             seen = weight > 0
             good = np.flatnonzero(seen.mean(axis=1) >= LEAST_SEEN)
@@ -153,7 +172,9 @@ def _windower(interferometer: Interferometer) -> Callable[[Array], tuple[Array, 
     """rows (cell, col) → OPD and window, one for all cells where rows do not matter."""
 
     def window(opd: Array) -> Array:
-        return fourier.mertz_ramp(opd, interferometer.shortest_side) * fourier.apodization("connes", opd / interferometer.longest_opd)
+        return fourier.mertz_ramp(opd, interferometer.shortest_side) * fourier.apodization(
+            "connes", opd / interferometer.longest_opd
+        )
 
     columns = np.arange(interferometer.cols)
     if interferometer.fringe_tilt == 0.0:

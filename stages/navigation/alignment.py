@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Start:
-    """The state at `time` [s]: lat, lon [rad], height [m]; velocity NED [m/s]; rpy [rad]; and sigmas (3,) each (position in m)."""
+    """The state at `time` [s]: lat, lon [rad], height [m]; velocity NED [m/s]; rpy [rad]; sigmas (3,) each (position in m)."""
 
     time: float
     position: Array
@@ -44,7 +44,9 @@ def gnss_velocity(gnss: Gnss) -> Array:
         return gnss.velocity
     north, east = radii_of_curvature(gnss.latitude)
     rate = np.stack([np.gradient(v, gnss.time) for v in (gnss.latitude, gnss.longitude, gnss.height)], 1)
-    return rate * np.stack([north + gnss.height, (east + gnss.height) * np.cos(gnss.latitude), -np.ones(gnss.time.size)], 1)
+    return rate * np.stack(
+        [north + gnss.height, (east + gnss.height) * np.cos(gnss.latitude), -np.ones(gnss.time.size)], 1
+    )
 
 
 def kinematics(time: float, gnss: Gnss, dcm: Array, lever: Array) -> tuple[Array, Array, Array, Array]:
@@ -59,14 +61,17 @@ def kinematics(time: float, gnss: Gnss, dcm: Array, lever: Array) -> tuple[Array
     v = velocity[i]
     north, east = radii_of_curvature(gnss.latitude[i])
     offset = v * dt - dcm @ lever
-    position = np.array([
-        gnss.latitude[i] + offset[0] / (north + gnss.height[i]),
-        gnss.longitude[i] + offset[1] / ((east + gnss.height[i]) * np.cos(gnss.latitude[i])),
-        gnss.height[i] - offset[2],
-    ])
+    position = np.array(
+        [
+            gnss.latitude[i] + offset[0] / (north + gnss.height[i]),
+            gnss.longitude[i] + offset[1] / ((east + gnss.height[i]) * np.cos(gnss.latitude[i])),
+            gnss.height[i] - offset[2],
+        ]
+    )
     sigma_v = gnss.sigma_velocity[i] if gnss.sigma_velocity is not None else np.full(3, 1.0)
     return (
-        position, v,
+        position,
+        v,
         np.sqrt(gnss.sigma_position[i] ** 2 + (2.5 * dt * dt) ** 2 + 0.1**2),
         np.sqrt(sigma_v**2 + (5.0 * dt) ** 2 + 0.1**2),
     )
@@ -107,7 +112,9 @@ def align(imu: Imu, gnss: Gnss, lever: Array, course_speed: float) -> Start:
     moving = np.flatnonzero(inside & (speed > course_speed))
     if moving.size == 0:
         raise InputError(
-            "gnss", "velocity", f"never exceeds {course_speed:g} m/s, so no heading can be taken from the course",
+            "gnss",
+            "velocity",
+            f"never exceeds {course_speed:g} m/s, so no heading can be taken from the course",
             "give flights[].initial in campaign.yaml or lower navigation.course_speed_m_per_s",
         )
     first = int(moving[0])
@@ -131,7 +138,16 @@ def _in_motion(imu: Imu, gnss: Gnss, velocity: Array, first: int, lever: Array) 
     roll, pitch = level(_mean_force(imu, time, time + 1.0), force, yaw)
     rpy = np.array([roll, pitch, yaw])
     position, v, sigma_r, sigma_v = kinematics(time, gnss, rpy_to_dcm(*rpy), lever)
-    return Start(time, position, v, rpy, sigma_r, sigma_v, np.deg2rad([3.0, 3.0, 10.0]), "in motion: GNSS course and acceleration")
+    return Start(
+        time,
+        position,
+        v,
+        rpy,
+        sigma_r,
+        sigma_v,
+        np.deg2rad([3.0, 3.0, 10.0]),
+        "in motion: GNSS course and acceleration",
+    )
 
 
 def _from_rest(imu: Imu, gnss: Gnss, velocity: Array, moving: NDArray[np.int64], start: float, lever: Array) -> Start:
@@ -154,4 +170,13 @@ def _from_rest(imu: Imu, gnss: Gnss, velocity: Array, moving: NDArray[np.int64],
     yaw = float(np.angle(np.mean(headings)))
     rpy = np.array([roll, pitch, yaw])
     position, v, sigma_r, sigma_v = kinematics(start, gnss, rpy_to_dcm(*rpy), lever)
-    return Start(start, position, v, rpy, sigma_r, sigma_v, np.deg2rad([2.0, 2.0, 20.0]), "from rest: levelling, then GNSS course")
+    return Start(
+        start,
+        position,
+        v,
+        rpy,
+        sigma_r,
+        sigma_v,
+        np.deg2rad([2.0, 2.0, 20.0]),
+        "from rest: levelling, then GNSS course",
+    )

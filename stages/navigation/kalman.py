@@ -51,7 +51,16 @@ def _cross_into(matrix: Any, row: int, col: int, x: float, y: float, z: float, s
 
 
 @numba.njit(cache=True, nogil=True)
-def dynamics(position: Any, velocity: Any, force: Any, mean_dcm: Any, mean_dcm_rate: Any, mean_dcm_force: Any, inverse_tau: Any, out: Any) -> None:
+def dynamics(
+    position: Any,
+    velocity: Any,
+    force: Any,
+    mean_dcm: Any,
+    mean_dcm_rate: Any,
+    mean_dcm_force: Any,
+    inverse_tau: Any,
+    out: Any,
+) -> None:
     """The error dynamics F (21, 21) at the epoch's mean: C f [m/s²] in NED, C, C·diag(ω), C·diag(f)."""
     out[:] = 0.0
     lat, h = position[0], position[2]
@@ -119,13 +128,46 @@ def _propagate(P: Any, transition: Any, noise: Any, dt: float) -> Any:
 
 @numba.njit(cache=True, nogil=True)
 def forward(
-    time: Any, gyro: Any, accel: Any, gap: Any,
-    fix_time: Any, fix_position: Any, fix_velocity: Any, fix_variance: Any, fix_rate: Any, fix_size: Any,
-    lever: Any, position: Any, velocity: Any, q: Any, bias: Any, P0: Any,
-    noise: Any, gap_noise: Any, inverse_tau: Any, epoch_s: float, gates: Any, reentry_s: float,
-    out_position: Any, out_velocity: Any, out_q: Any, out_epoch: Any, out_bias: Any,
-    epoch_time: Any, epoch_P: Any, epoch_phi: Any, epoch_fix: Any, epoch_dx: Any, epoch_bias: Any, epoch_dcm: Any,
-    H_all: Any, S_inv_all: Any, K_all: Any, innovation_all: Any, nis: Any, used: Any,
+    time: Any,
+    gyro: Any,
+    accel: Any,
+    gap: Any,
+    fix_time: Any,
+    fix_position: Any,
+    fix_velocity: Any,
+    fix_variance: Any,
+    fix_rate: Any,
+    fix_size: Any,
+    lever: Any,
+    position: Any,
+    velocity: Any,
+    q: Any,
+    bias: Any,
+    P0: Any,
+    noise: Any,
+    gap_noise: Any,
+    inverse_tau: Any,
+    epoch_s: float,
+    gates: Any,
+    reentry_s: float,
+    out_position: Any,
+    out_velocity: Any,
+    out_q: Any,
+    out_epoch: Any,
+    out_bias: Any,
+    epoch_time: Any,
+    epoch_P: Any,
+    epoch_phi: Any,
+    epoch_fix: Any,
+    epoch_dx: Any,
+    epoch_bias: Any,
+    epoch_dcm: Any,
+    H_all: Any,
+    S_inv_all: Any,
+    K_all: Any,
+    innovation_all: Any,
+    nis: Any,
+    used: Any,
 ) -> Any:
     """Filter the whole flight; returns the number of epochs.
 
@@ -187,8 +229,14 @@ def forward(
                 phi = epoch_phi[epoch]
                 if elapsed > 0.0:
                     dynamics(
-                        position, velocity, sum_force / elapsed, sum_dcm / elapsed, sum_rate / elapsed,
-                        sum_cf / elapsed, inverse_tau, F,
+                        position,
+                        velocity,
+                        sum_force / elapsed,
+                        sum_dcm / elapsed,
+                        sum_rate / elapsed,
+                        sum_cf / elapsed,
+                        inverse_tau,
+                        F,
                     )
                     F *= elapsed
                     phi[:] = identity + F + 0.5 * (F @ F)
@@ -294,7 +342,19 @@ def forward(
 
 
 @numba.njit(cache=True, nogil=True)
-def backward(count: int, epoch_P: Any, epoch_phi: Any, epoch_fix: Any, H_all: Any, S_inv_all: Any, K_all: Any, innovation_all: Any, fix_size: Any, correction: Any, smoothed_P: Any) -> None:
+def backward(
+    count: int,
+    epoch_P: Any,
+    epoch_phi: Any,
+    epoch_fix: Any,
+    H_all: Any,
+    S_inv_all: Any,
+    K_all: Any,
+    innovation_all: Any,
+    fix_size: Any,
+    correction: Any,
+    smoothed_P: Any,
+) -> None:
     """Modified Bryson–Frazier recursion over the first `count` epochs.
 
     Fills correction (count, 21), to be added to the estimate after each epoch, and the smoothed covariance of position,

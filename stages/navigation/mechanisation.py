@@ -4,7 +4,7 @@ Functions
 ---------
 increments      mean rates → rotation and velocity increments with two-sample coning and sculling
 step            one strapdown step of position, velocity and attitude
-quaternion_to_dcm, dcm_to_quaternion, rotate_ned
+quaternion_to_dcm, rotate_ned
 
 Attitude is the quaternion (w, x, y, z) body → NED. All functions are numba-compiled and take plain arrays, since they
 run once a sample.
@@ -25,28 +25,11 @@ import numpy as np
 
 from tsmftis import geodesy
 
-A = geodesy.SEMI_MAJOR_AXIS
-E2 = geodesy.ECCENTRICITY_SQUARED
-F = geodesy.FLATTENING
 OMEGA = geodesy.EARTH_RATE
-GE = geodesy.GRAVITY_EQUATOR
-KS = geodesy.SOMIGLIANA_K
-M = OMEGA**2 * A**3 * (1.0 - F) / geodesy.GM
 
-
-@numba.njit(cache=True, nogil=True)
-def gravity(latitude: float, height: float) -> Any:
-    """`tsmftis.geodesy.normal_gravity` for one point."""
-    s2 = math.sin(latitude) ** 2
-    surface = GE * (1.0 + KS * s2) / math.sqrt(1.0 - E2 * s2)
-    return surface * (1.0 - 2.0 / A * (1.0 + F + M - 2.0 * F * s2) * height + 3.0 * (height / A) ** 2)
-
-
-@numba.njit(cache=True, nogil=True)
-def radii(latitude: float) -> Any:
-    """`tsmftis.geodesy.radii_of_curvature` for one point."""
-    s = 1.0 - E2 * math.sin(latitude) ** 2
-    return A * (1.0 - E2) / (s * math.sqrt(s)), A / math.sqrt(s)
+# One ellipsoid and one gravity for the whole project, compiled for single points.
+gravity = numba.njit(cache=True, nogil=True)(geodesy.normal_gravity)
+radii = numba.njit(cache=True, nogil=True)(geodesy.radii_of_curvature)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -61,14 +44,6 @@ def quaternion_to_dcm(q: Any, out: Any) -> None:
     out[2, 0] = 2.0 * (x * z - w * y)
     out[2, 1] = 2.0 * (y * z + w * x)
     out[2, 2] = 1.0 - 2.0 * (x * x + y * y)
-
-
-def dcm_to_quaternion(dcm: np.ndarray) -> np.ndarray:
-    """(w, x, y, z) of one DCM, w ≥ 0 where possible."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(dcm).as_quat()
-    return np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -109,7 +84,9 @@ def rotate_ned(q: Any, phi: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def increments(gyro: Any, accel: Any, gyro_before: Any, accel_before: Any, dt: float, dt_before: float, theta: Any, dv: Any) -> None:
+def increments(
+    gyro: Any, accel: Any, gyro_before: Any, accel_before: Any, dt: float, dt_before: float, theta: Any, dv: Any
+) -> None:
     """Rotation vector and velocity increment of one interval from mean rates, Savage's two-sample form [1]_.
 
     Δθ = α + (1/12) α₋×α, Δv = υ + ½ α×υ + (1/12)(α₋×υ + υ₋×α), α = ω·dt, υ = f·dt, and α₋, υ₋ the preceding interval's
@@ -141,9 +118,9 @@ def step(position: Any, velocity: Any, q: Any, dcm: Any, theta: Any, dv: Any, dt
     vn, ve, vd = velocity[0], velocity[1], velocity[2]
     g = gravity(lat, h)
     # Velocity half an interval ahead, for the Coriolis and transport terms.
-    ax = (dcm[0, 0] * dv[0] + dcm[0, 1] * dv[1] + dcm[0, 2] * dv[2])
-    ay = (dcm[1, 0] * dv[0] + dcm[1, 1] * dv[1] + dcm[1, 2] * dv[2])
-    az = (dcm[2, 0] * dv[0] + dcm[2, 1] * dv[1] + dcm[2, 2] * dv[2])
+    ax = dcm[0, 0] * dv[0] + dcm[0, 1] * dv[1] + dcm[0, 2] * dv[2]
+    ay = dcm[1, 0] * dv[0] + dcm[1, 1] * dv[1] + dcm[1, 2] * dv[2]
+    az = dcm[2, 0] * dv[0] + dcm[2, 1] * dv[1] + dcm[2, 2] * dv[2]
     mn, me, md = vn + 0.5 * ax, ve + 0.5 * ay, vd + 0.5 * (az + g * dt)
     ien, ied = OMEGA * math.cos(lat), -OMEGA * math.sin(lat)
     enn, ene, end = me / (re + h), -mn / (rn + h), -me * math.tan(lat) / (re + h)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,18 +10,18 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.stats import chi2
 
 from pipeline.errors import InputError
-from pipeline.records import Gnss, Imu, ThermalCorrection, Trajectory
+from pipeline.records import Gnss, Imu, ThermalCorrection
 from stages.navigation import kalman
 from stages.navigation.alignment import Start, align, given
-from stages.navigation.mechanisation import dcm_to_quaternion
+from stages.navigation.output import NavigationResult, assemble
 from tsmftis.camera import Mounting
-from tsmftis.geodesy import earth_rate_ned
+from tsmftis.geodesy import radii_of_curvature
 from tsmftis.inertial import ImuModel
-from tsmftis.rotation import dcm_to_rpy, exp_so3, rpy_to_dcm
+from tsmftis.rotation import dcm_to_quaternion, dcm_to_rpy, exp_so3, rpy_jacobian, rpy_to_dcm
 
 Array = NDArray[np.float64]
 
-GAP_FACTOR = 2.5        # an interval longer than this many nominal ones is a gap in the data
+GAP_FACTOR = 2.5  # an interval longer than this many nominal ones is a gap in the data
 
 
 class NavigationSettings(BaseModel):
@@ -32,19 +31,14 @@ class NavigationSettings(BaseModel):
 
     epoch_s: float = Field(0.1, gt=0, le=1.0, description="longest step of the covariance")
     gate_probability: float = Field(1e-6, gt=0, lt=0.1, description="chance that a good fix is rejected")
-    reentry_s: float = Field(5.0, gt=0, description="without an accepted fix for so long, fixes are weighed down instead of rejected")
-    course_speed_m_per_s: float = Field(1.0, gt=0, description="least speed whose course is taken for the heading when the pipeline aligns itself")
+    reentry_s: float = Field(
+        5.0, gt=0, description="without an accepted fix for so long, fixes are weighed down instead of rejected"
+    )
+    course_speed_m_per_s: float = Field(
+        1.0, gt=0, description="least speed whose course is taken for the heading when the pipeline aligns itself"
+    )
     use_gnss_velocity: bool = True
     passes: int = Field(3, ge=1, le=6, description="most filter passes when the first attitude was poor")
-
-
-@dataclass(frozen=True)
-class NavigationResult:
-    """The trajectory at IMU rate and what a person must know to trust it (`quality` is plain data for run.json and the report)."""
-
-    trajectory: Trajectory
-    quality: dict[str, Any]
-    figures: dict[str, list[float]]
 
 
 def run(
@@ -67,8 +61,10 @@ def run(
     overlap = (gnss.time >= imu.time[0]) & (gnss.time <= imu.time[-1])
     if overlap.sum() < 5:
         raise InputError(
-            "gnss", "variable 'time'",
-            f"spans {gnss.time[0]:.1f} to {gnss.time[-1]:.1f} s and the IMU {imu.time[0]:.1f} to {imu.time[-1]:.1f} s, so {int(overlap.sum())} fixes overlap",
+            "gnss",
+            "variable 'time'",
+            f"spans {gnss.time[0]:.1f} to {gnss.time[-1]:.1f} s and the IMU {imu.time[0]:.1f} to {imu.time[-1]:.1f} s, "
+            f"so {int(overlap.sum())} fixes overlap",
             "both must be seconds on the campaign's one clock",
         )
     start = _start(imu, gnss, lever, settings, initial)
@@ -82,7 +78,7 @@ def run(
         # The first attitude was poor, so the filter linearised about a poor path: start again from the smoothed one. The
         # prior is kept as wide as it was; beside the flight's own information it counts for nothing.
         start, bias = _shifted(start, bias, shift)
-    return _result(used_imu, gnss, solution, start, settings, number + 1)
+    return assemble(used_imu, gnss, solution, start, number + 1)
 
 
 def in_body_axes(imu: Imu, mounting: Mounting, correction: ThermalCorrection | None) -> Imu:
@@ -95,13 +91,17 @@ def in_body_axes(imu: Imu, mounting: Mounting, correction: ThermalCorrection | N
     return Imu(imu.time, np.ascontiguousarray(gyro @ turn.T), np.ascontiguousarray(accel @ turn.T), imu.temperatures)
 
 
-def _start(imu: Imu, gnss: Gnss, lever: Array, settings: NavigationSettings, initial: tuple[float, Array, Array] | None) -> Start:
+def _start(
+    imu: Imu, gnss: Gnss, lever: Array, settings: NavigationSettings, initial: tuple[float, Array, Array] | None
+) -> Start:
     if initial is None:
         return align(imu, gnss, lever, settings.course_speed_m_per_s)
     time, rpy, sigma = initial
     if not imu.time[0] - 1.0 <= time < imu.time[-1]:
         raise InputError(
-            "campaign.yaml", "flights[].initial.time_s", f"{time:g} s lies outside the IMU's {imu.time[0]:.2f} to {imu.time[-1]:.2f} s",
+            "campaign.yaml",
+            "flights[].initial.time_s",
+            f"{time:g} s lies outside the IMU's {imu.time[0]:.2f} to {imu.time[-1]:.2f} s",
             "give a time inside the flight, or leave `initial` out",
         )
     return given(max(time, float(imu.time[0])), rpy, sigma, gnss, lever)
@@ -118,16 +118,24 @@ def _from(imu: Imu, time: float) -> Imu:
 
 
 def _shifted(start: Start, bias: Array, shift: Array) -> tuple[Start, Array]:
-    from tsmftis.geodesy import radii_of_curvature
-
     north, east = radii_of_curvature(start.position[0])
-    position = start.position + shift[:3] / np.array([
-        north + start.position[2], (east + start.position[2]) * np.cos(start.position[0]), -1.0,
-    ])
+    position = start.position + shift[:3] / np.array(
+        [
+            north + start.position[2],
+            (east + start.position[2]) * np.cos(start.position[0]),
+            -1.0,
+        ]
+    )
     rpy = np.array(dcm_to_rpy(exp_so3(shift[kalman.ATTITUDE]) @ rpy_to_dcm(*start.rpy)))
     moved = Start(
-        start.time, position, start.velocity + shift[kalman.VELOCITY], rpy,
-        start.sigma_position, start.sigma_velocity, start.sigma_rpy, start.method,
+        start.time,
+        position,
+        start.velocity + shift[kalman.VELOCITY],
+        rpy,
+        start.sigma_position,
+        start.sigma_velocity,
+        start.sigma_rpy,
+        start.method,
     )
     return moved, bias + shift[9:]
 
@@ -136,29 +144,15 @@ def _initial_covariance(start: Start, model: ImuModel) -> Array:
     variance = np.zeros(kalman.NSTATE)
     variance[kalman.POSITION], variance[kalman.VELOCITY] = start.sigma_position**2, start.sigma_velocity**2
     variance[kalman.GYRO_BIAS], variance[kalman.ACCEL_BIAS] = model.gyro.bias_sigma**2, model.accel.bias_sigma**2
-    variance[kalman.GYRO_SCALE], variance[kalman.ACCEL_SCALE] = model.gyro.scale_factor_sigma**2, model.accel.scale_factor_sigma**2
+    variance[kalman.GYRO_SCALE], variance[kalman.ACCEL_SCALE] = (
+        model.gyro.scale_factor_sigma**2,
+        model.accel.scale_factor_sigma**2,
+    )
     P = np.diag(variance)
     # Sigmas of roll, pitch, yaw into the NED rotation vector: φ = M·δrpy, the inverse of `rpy_jacobian`.
     to_ned = np.linalg.inv(rpy_jacobian(start.rpy[None])[0])
     P[kalman.ATTITUDE, kalman.ATTITUDE] = to_ned @ np.diag(start.sigma_rpy**2) @ to_ned.T
     return P
-
-
-def rpy_jacobian(rpy: Array) -> Array:
-    """∂(roll, pitch, yaw)/∂φ for C_true = exp(φ×)·C, φ in NED; (n, 3) → (n, 3, 3).
-
-    δroll = (cos y·φ_N + sin y·φ_E)/cos p, δpitch = −sin y·φ_N + cos y·φ_E, δyaw = φ_D + tan p·(cos y·φ_N + sin y·φ_E).
-    """
-    _, p, y = rpy.T
-    zero, one = np.zeros_like(p), np.ones_like(p)
-    return np.stack(
-        [
-            np.stack([np.cos(y) / np.cos(p), np.sin(y) / np.cos(p), zero], -1),
-            np.stack([-np.sin(y), np.cos(y), zero], -1),
-            np.stack([np.tan(p) * np.cos(y), np.tan(p) * np.sin(y), one], -1),
-        ],
-        -2,
-    )
 
 
 def _process_noise(model: ImuModel) -> Array:
@@ -185,7 +179,9 @@ def _filter_and_smooth(
 
     with_velocity = gnss.velocity is not None and gnss.sigma_velocity is not None and settings.use_gnss_velocity
     velocity = gnss.velocity if with_velocity else np.zeros((nfix, 3))
-    variance = np.concatenate([gnss.sigma_position, gnss.sigma_velocity if with_velocity else np.ones((nfix, 3))], 1) ** 2
+    variance = (
+        np.concatenate([gnss.sigma_position, gnss.sigma_velocity if with_velocity else np.ones((nfix, 3))], 1) ** 2
+    )
     fix_size = np.full(nfix, 6 if with_velocity else 3, np.int64)
     middle = imu.time[1:] - 0.5 * steps[1:]
     fix_rate = np.stack([np.interp(gnss.time, middle, imu.gyro[1:, i]) for i in range(3)], 1)
@@ -194,128 +190,88 @@ def _filter_and_smooth(
     size = nfix + int(np.ceil((imu.time[-1] - imu.time[0]) / settings.epoch_s)) + 2
     s = kalman.NSTATE
     out = {
-        "position": np.empty((n, 3)), "velocity": np.empty((n, 3)), "q": np.empty((n, 4)),
-        "epoch": np.empty(n, np.int64), "bias": np.empty((n, 12)),
-        "epoch_time": np.empty(size), "epoch_P": np.empty((size, s, s)), "epoch_phi": np.empty((size, s, s)),
-        "epoch_fix": np.full(size, -1, np.int64), "epoch_dx": np.zeros((size, s)), "epoch_bias": np.empty((size, 12)),
+        "position": np.empty((n, 3)),
+        "velocity": np.empty((n, 3)),
+        "q": np.empty((n, 4)),
+        "epoch": np.empty(n, np.int64),
+        "bias": np.empty((n, 12)),
+        "epoch_time": np.empty(size),
+        "epoch_P": np.empty((size, s, s)),
+        "epoch_phi": np.empty((size, s, s)),
+        "epoch_fix": np.full(size, -1, np.int64),
+        "epoch_dx": np.zeros((size, s)),
+        "epoch_bias": np.empty((size, 12)),
         "epoch_dcm": np.empty((size, 3, 3)),
-        "H": np.zeros((nfix, 6, s)), "S_inv": np.zeros((nfix, 6, 6)), "K": np.zeros((nfix, s, 6)),
-        "innovation": np.zeros((nfix, 6)), "nis": np.full(nfix, np.nan), "used": np.zeros(nfix, np.bool_),
+        "H": np.zeros((nfix, 6, s)),
+        "S_inv": np.zeros((nfix, 6, 6)),
+        "K": np.zeros((nfix, s, 6)),
+        "innovation": np.zeros((nfix, 6)),
+        "nis": np.full(nfix, np.nan),
+        "used": np.zeros(nfix, np.bool_),
     }
     tau = np.repeat([model.gyro.bias_correlation_time, model.accel.bias_correlation_time], 3)
     count = kalman.forward(
-        imu.time, imu.gyro, imu.accel, gap,
-        gnss.time, np.stack([gnss.latitude, gnss.longitude, gnss.height], 1), velocity, variance, fix_rate, fix_size,
-        lever, start.position.copy(), start.velocity.copy(), dcm_to_quaternion(rpy_to_dcm(*start.rpy)), bias.copy(),
-        _initial_covariance(start, model), _process_noise(model), gap_noise, 1.0 / tau, settings.epoch_s, gates, settings.reentry_s,
-        out["position"], out["velocity"], out["q"], out["epoch"], out["bias"],
-        out["epoch_time"], out["epoch_P"], out["epoch_phi"], out["epoch_fix"], out["epoch_dx"], out["epoch_bias"],
-        out["epoch_dcm"], out["H"], out["S_inv"], out["K"], out["innovation"], out["nis"], out["used"],
+        imu.time,
+        imu.gyro,
+        imu.accel,
+        gap,
+        gnss.time,
+        np.stack([gnss.latitude, gnss.longitude, gnss.height], 1),
+        velocity,
+        variance,
+        fix_rate,
+        fix_size,
+        lever,
+        start.position.copy(),
+        start.velocity.copy(),
+        dcm_to_quaternion(rpy_to_dcm(*start.rpy)),
+        bias.copy(),
+        _initial_covariance(start, model),
+        _process_noise(model),
+        gap_noise,
+        1.0 / tau,
+        settings.epoch_s,
+        gates,
+        settings.reentry_s,
+        out["position"],
+        out["velocity"],
+        out["q"],
+        out["epoch"],
+        out["bias"],
+        out["epoch_time"],
+        out["epoch_P"],
+        out["epoch_phi"],
+        out["epoch_fix"],
+        out["epoch_dx"],
+        out["epoch_bias"],
+        out["epoch_dcm"],
+        out["H"],
+        out["S_inv"],
+        out["K"],
+        out["innovation"],
+        out["nis"],
+        out["used"],
     )
     correction, smoothed = np.zeros((count, s)), np.empty((count, 9, 9))
     kalman.backward(
-        count, out["epoch_P"], out["epoch_phi"], out["epoch_fix"], out["H"], out["S_inv"], out["K"], out["innovation"],
-        fix_size, correction, smoothed,
+        count,
+        out["epoch_P"],
+        out["epoch_phi"],
+        out["epoch_fix"],
+        out["H"],
+        out["S_inv"],
+        out["K"],
+        out["innovation"],
+        fix_size,
+        correction,
+        smoothed,
     )
-    return out | {"count": count, "correction": correction, "smoothed_P": smoothed, "gap": gap, "fix_size": fix_size, "variance": variance, "lever": lever}
-
-
-def _result(
-    imu: Imu, gnss: Gnss, s: dict[str, Any], start: Start, settings: NavigationSettings, passes: int
-) -> NavigationResult:
-    from tsmftis.geodesy import radii_of_curvature
-
-    count, epoch, time = s["count"], s["epoch"], imu.time
-    epoch_time, correction = s["epoch_time"][:count], s["correction"]
-    following = np.minimum(epoch + 1, count - 1)
-    span = epoch_time[following] - epoch_time[epoch]
-    part = np.divide(time - epoch_time[epoch], span, out=np.zeros(time.size), where=span > 0)[:, None]
-    # Between two epochs the correction runs from the one after the first to the one before the second's update.
-    arriving = correction[following] + s["epoch_dx"][following] * (following > epoch)[:, None]
-    shift = (1.0 - part) * correction[epoch] + part * arriving
-
-    north, east = radii_of_curvature(s["position"][:, 0])
-    height = s["position"][:, 2]
-    dcm = np.empty((time.size, 3, 3))
-    for i in range(0, time.size, 200_000):
-        block = slice(i, i + 200_000)
-        w, x, y, z = s["q"][block].T
-        from scipy.spatial.transform import Rotation
-
-        dcm[block] = exp_so3(shift[block, 6:9]) @ Rotation.from_quat(np.stack([x, y, z, w], 1)).as_matrix()
-    rpy = np.stack(dcm_to_rpy(dcm), 1)
-    latitude = s["position"][:, 0] + shift[:, 0] / (north + height)
-    longitude = s["position"][:, 1] + shift[:, 1] / ((east + height) * np.cos(s["position"][:, 0]))
-    bias = s["bias"] + shift[:, 9:]
-
-    P = s["smoothed_P"]
-    epoch_rpy = np.stack(dcm_to_rpy(s["epoch_dcm"][:count]), 1)
-    J = rpy_jacobian(epoch_rpy)
-    variance = np.concatenate(
-        [np.einsum("nii->ni", P)[:, :6], np.einsum("nij,njk,nik->ni", J, P[:, 6:9, 6:9], J)], axis=1
-    )
-    sigma = np.sqrt(np.maximum(variance, 0.0))
-    sigmas = np.stack([np.interp(time, epoch_time, sigma[:, i]) for i in range(9)], 1)
-
-    rate = (imu.gyro - bias[:, 0:3]) / (1.0 + bias[:, 6:9])
-    force = (imu.accel - bias[:, 3:6]) / (1.0 + bias[:, 9:12])
-    trajectory = Trajectory(
-        time, latitude, longitude, height - shift[:, 2], s["velocity"] + shift[:, 3:6], rpy,
-        sigmas[:, 0:3], sigmas[:, 3:6], sigmas[:, 6:9], rate, force,
-    )
-    quality, figures = _quality(imu, gnss, s, trajectory, bias, start, passes)
-    return NavigationResult(trajectory, quality, figures)
-
-
-def _quality(
-    imu: Imu, gnss: Gnss, s: dict[str, Any], trajectory: Trajectory, bias: Array, start: Start, passes: int
-) -> tuple[dict[str, Any], dict[str, list[float]]]:
-    """Plain data for run.json and the report: innovations, rejected fixes, residuals of the smoothed path, gaps, biases."""
-    used, nis, size = s["used"], s["nis"], s["fix_size"]
-    seen = np.isfinite(nis)
-    residual = _antenna_residuals(trajectory, gnss, s["lever"], used)
-    steps = np.diff(imu.time)
-    gaps = [{"start_s": float(imu.time[i]), "length_s": float(steps[i])} for i in np.flatnonzero(s["gap"][1:])]
-    quality = {
-        "alignment": start.method,
-        "passes": passes,
-        "fixes": {"used": int(used.sum()), "rejected": int((seen & ~used).sum()), "outside_imu": int((~seen).sum())},
-        "rejected_times_s": [float(t) for t in gnss.time[seen & ~used][:100]],
-        "innovation_nis_mean": float(np.mean(nis[used])) if used.any() else None,
-        "innovation_nis_expected": float(size[used].mean()) if used.any() else None,
-        "position_residual_rms_m": float(np.sqrt((residual**2).sum(axis=1).mean())) if used.any() else None,
-        "position_residual_rms_ned_m": [float(v) for v in np.sqrt((residual**2).mean(axis=0))] if used.any() else [],
-        "imu_gaps": gaps[:100],
-        "imu_gap_count": len(gaps),
-        "gyro_bias_deg_per_h": [float(v) for v in np.rad2deg(bias[:, 0:3].mean(axis=0)) * 3600],
-        "accel_bias_ug": [float(v) for v in bias[:, 3:6].mean(axis=0) / 9.80665e-6],
-        "sigma_position_m_median": [float(v) for v in np.median(trajectory.sigma_position, axis=0)],
-        "sigma_attitude_deg_median": [float(v) for v in np.rad2deg(np.median(trajectory.sigma_attitude, axis=0))],
+    return out | {
+        "count": count,
+        "correction": correction,
+        "smoothed_P": smoothed,
+        "gap": gap,
+        "fix_size": fix_size,
+        "variance": variance,
+        "lever": lever,
     }
-    figures = {
-        "fix_time": gnss.time[seen].tolist(),
-        "fix_nis": nis[seen].tolist(),
-        "fix_used": used[seen].astype(float).tolist(),
-        "residual_time": gnss.time[used].tolist(),
-        **{f"residual_{n}": residual[:, i].tolist() for i, n in enumerate(("north", "east", "down"))},
-    }
-    return quality, figures
-
-
-def _antenna_residuals(trajectory: Trajectory, gnss: Gnss, lever: Array, used: NDArray[np.bool_]) -> Array:
-    """Fix minus smoothed antenna position, NED [m], for the used fixes (n, 3)."""
-    from tsmftis.geodesy import local_metres
-
-    time = gnss.time[used]
-    at = [np.interp(time, trajectory.time, v) for v in (trajectory.latitude, trajectory.longitude, trajectory.height)]
-    rpy = [np.interp(time, trajectory.time, np.unwrap(trajectory.rpy[:, i])) for i in range(3)]
-    arm = rpy_to_dcm(*rpy) @ lever
-    origin = float(at[0].mean()), float(at[1].mean()), float(at[2].mean())
-    fix = local_metres(gnss.latitude[used], gnss.longitude[used], gnss.height[used], *origin)
-    return fix - local_metres(at[0], at[1], at[2], *origin) - arm
-
-
-def antenna_rate(trajectory: Trajectory) -> Array:
-    """Rate of the body against the Earth, body axes (n, 3) [rad/s]: the compensated rate less Earth rotation."""
-    dcm = rpy_to_dcm(*trajectory.rpy.T)
-    return trajectory.rate - np.einsum("nji,nj->ni", dcm, earth_rate_ned(trajectory.latitude))

@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 
 # The score is defined on these; they are no settings.
 APODIZATION = "connes"
-LEAST_SEEN = 0.97           # of the columns, for a point to count
-LEAST_POINTS = 5            # of the 25, for an area to count
+LEAST_SEEN = 0.97  # of the columns, for a point to count
+LEAST_POINTS = 5  # of the 25, for an area to count
 
 
 class ReconstructionSettings(BaseModel):
@@ -27,7 +27,9 @@ class ReconstructionSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    drift_order: int = Field(1, ge=0, le=4, description="polynomial in OPD taken off each interferogram: 0 is the mean alone")
+    drift_order: int = Field(
+        1, ge=0, le=4, description="polynomial in OPD taken off each interferogram: 0 is the mean alone"
+    )
     phase_order: int = Field(2, ge=1, le=6, description="polynomial order of the instrument's phase over wavenumber")
     block_frames: int = Field(256, ge=2, description="frames held in memory at a time")
 
@@ -64,33 +66,54 @@ def run(
     leading = tracks.methods.index("tracking") if "tracking" in tracks.methods else len(tracks.methods) - 1
     counted = ifg.seen >= LEAST_SEEN
     if not counted[leading].any():
-        raise StageError("no target crosses enough columns of the detector: the line is too short or the targets lie off its track")
+        raise StageError(
+            "no target crosses enough columns of the detector: the line is too short or the targets lie off its track"
+        )
     opd = ifg.opd(interferometer)
     ac = fourier.remove_constant(ifg.value, opd, settings.drift_order)
-    phase = instrument_phase(ac[leading][counted[leading]], _of(opd, leading, counted), interferometer, wavenumber, settings.phase_order)
+    phase = instrument_phase(
+        ac[leading][counted[leading]], _of(opd, leading, counted), interferometer, wavenumber, settings.phase_order
+    )
     read_variance, gain = noise_model(ifg, ac, leading, counted, interferometer)
     variance = read_variance + gain * np.maximum(ifg.value, 0.0)
 
     phi = fourier.smooth_phase(phase, wavenumber)
-    window = fourier.mertz_ramp(opd, interferometer.shortest_side) * fourier.apodization(APODIZATION, opd / interferometer.longest_opd)
+    window = fourier.mertz_ramp(opd, interferometer.shortest_side) * fourier.apodization(
+        APODIZATION, opd / interferometer.longest_opd
+    )
     value, sigma = fourier.radiance(ac, opd, window, wavenumber, phi, response, variance * ifg.gain)
     value[~counted], sigma[~counted] = np.nan, np.nan
     area, sigma_area = _area(ifg, tracks, ac, variance, counted, opd, window, wavenumber, phi, response, camera)
     centre = Tracks.CENTRE
     spectra = Spectra(
-        tracks.methods, tracks.targets, wavenumber, value[:, :, centre], sigma[:, :, centre], area, sigma_area,
-        scored_references(targets, references, calibration, interferometer, wavenumber), counted.sum(axis=2),
+        tracks.methods,
+        tracks.targets,
+        wavenumber,
+        value[:, :, centre],
+        sigma[:, :, centre],
+        area,
+        sigma_area,
+        scored_references(targets, references, calibration, interferometer, wavenumber),
+        counted.sum(axis=2),
         {
-            "apodization": APODIZATION, "phase_coefficients": " ".join(f"{c:.9g}" for c in phase),
-            "phase_method": "Mertz, one polynomial for the line", "drift_order": settings.drift_order,
-            "read_variance_dn2": read_variance, "gain_dn": gain,
+            "apodization": APODIZATION,
+            "phase_coefficients": " ".join(f"{c:.9g}" for c in phase),
+            "phase_method": "Mertz, one polynomial for the line",
+            "drift_order": settings.drift_order,
+            "read_variance_dn2": read_variance,
+            "gain_dn": gain,
         },
     )
     return ReconstructionResult(spectra, ifg, phase, read_variance, gain)
 
 
 def extract(
-    frames: Frames, tracks: Tracks, calibration: Calibration, camera: Camera, interferometer: Interferometer, settings: ReconstructionSettings
+    frames: Frames,
+    tracks: Tracks,
+    calibration: Calibration,
+    camera: Camera,
+    interferometer: Interferometer,
+    settings: ReconstructionSettings,
 ) -> Interferograms:
     """Interferograms of all points (method, target, point, col), frames read in blocks that overlap by one."""
     shape = tracks.row.shape[:3]
@@ -99,13 +122,16 @@ def extract(
     count = frames.time.size
     for first in range(0, count - 1, settings.block_frames):
         counts = frames.block(first, min(first + settings.block_frames + 1, count))
-        block = detector.correct(counts, calibration.dark, calibration.flat, camera.saturation, interferometer.detector_nonlinearity)
+        block = detector.correct(
+            counts, calibration.dark, calibration.flat, camera.saturation, interferometer.detector_nonlinearity
+        )
         extraction.along_tracks(block, first, row, col, value, gain, weight, mean_row)
     seen = weight > 0
     once = np.maximum(weight, 1.0)
     filled = extraction.fill_gaps(value / once, seen)
     return Interferograms(
-        tracks.methods, tracks.targets,
+        tracks.methods,
+        tracks.targets,
         filled.reshape(*shape, -1),
         extraction.fill_gaps(gain / once**2, seen).reshape(*shape, -1),
         extraction.fill_gaps(mean_row / once, seen).reshape(*shape, -1),
@@ -121,12 +147,18 @@ def instrument_phase(ac: Array, opd: Array, interferometer: Interferometer, wave
     return fourier.phase_polynomial(fourier.transform(ac, opd, window, wavenumber).sum(axis=0), wavenumber, order)
 
 
-def noise_model(ifg: Interferograms, ac: Array, leading: int, counted: NDArray[np.bool_], interferometer: Interferometer) -> tuple[float, float]:
+def noise_model(
+    ifg: Interferograms, ac: Array, leading: int, counted: NDArray[np.bool_], interferometer: Interferometer
+) -> tuple[float, float]:
     """read² and gain from the out-of-band power of the leading method's points against their mean signal."""
     chosen = counted[leading]
     opd = interferometer.opd((interferometer.rows - 1) / 2, np.arange(interferometer.cols))
     variance = detector.noise_out_of_band(
-        ac[leading][chosen], ifg.gain[leading][chosen], opd, interferometer.wavelength_low, interferometer.wavelength_high
+        ac[leading][chosen],
+        ifg.gain[leading][chosen],
+        opd,
+        interferometer.wavelength_low,
+        interferometer.wavelength_high,
     )
     return detector.photon_transfer(ifg.value[leading][chosen].mean(axis=-1), variance)
 
@@ -136,8 +168,17 @@ def _of(opd: Array, leading: int, counted: NDArray[np.bool_]) -> Array:
 
 
 def _area(
-    ifg: Interferograms, tracks: Tracks, ac: Array, variance: Array, counted: NDArray[np.bool_], opd: Array, window: Array,
-    wavenumber: Array, phi: Array, response: Array, camera: Camera,
+    ifg: Interferograms,
+    tracks: Tracks,
+    ac: Array,
+    variance: Array,
+    counted: NDArray[np.bool_],
+    opd: Array,
+    window: Array,
+    wavenumber: Array,
+    phi: Array,
+    response: Array,
+    camera: Camera,
 ) -> tuple[Array, Array]:
     """Mean spectrum of each area and its sigma: transform is linear, so the mean interferogram is transformed where all
     points share their OPDs, with the noise of shared pixels counted once."""
@@ -156,12 +197,18 @@ def _area(
             area[m, t] = one.mean(axis=0)
             mean_at, mean_w = (at, w) if opd.ndim == 1 else (at.mean(axis=0), w.mean(axis=0))
             mean_variance = variance[m, t, chosen].mean(axis=0) * gain
-            _, sigma[m, t] = fourier.radiance(ac[m, t, chosen].mean(axis=0), mean_at, mean_w, wavenumber, phi, response, mean_variance)
+            _, sigma[m, t] = fourier.radiance(
+                ac[m, t, chosen].mean(axis=0), mean_at, mean_w, wavenumber, phi, response, mean_variance
+            )
     return area, sigma
 
 
 def scored_references(
-    targets: Targets, references: References | None, calibration: Calibration, interferometer: Interferometer, wavenumber: Array
+    targets: Targets,
+    references: References | None,
+    calibration: Calibration,
+    interferometer: Interferometer,
+    wavenumber: Array,
 ) -> Array:
     """Each target's reference at the scored line shape (target, wavenumber); NaN where it has none."""
     out = np.full((len(targets.ids), wavenumber.size), np.nan)
@@ -169,7 +216,9 @@ def scored_references(
         return out
     for i, name in enumerate(targets.reference):
         if name:
-            table = np.interp(calibration.wavenumber, references.wavenumber, references.radiance[references.names.index(name)])
+            table = np.interp(
+                calibration.wavenumber, references.wavenumber, references.radiance[references.names.index(name)]
+            )
             out[i] = fourier.line_shape_response(
                 table, calibration.response, calibration.wavenumber, interferometer.longest_opd, APODIZATION, wavenumber
             )

@@ -24,7 +24,7 @@ from tsmftis.camera import Camera
 
 Array = NDArray[np.float64]
 
-BLOCK = 100     # frames read at a time
+BLOCK = 100  # frames read at a time
 
 
 class RegistrationSettings(BaseModel):
@@ -39,7 +39,9 @@ class RegistrationSettings(BaseModel):
     pyramid_levels: int = Field(3, ge=0, le=6)
     ransac_threshold_px: float = Field(0.7, gt=0)
     least_inliers: int = Field(12, ge=4, description="fewer inliers than this start a new key frame")
-    kept_fraction: float = Field(0.5, gt=0, lt=1, description="a new key frame when fewer of the corners are still followed")
+    kept_fraction: float = Field(
+        0.5, gt=0, lt=1, description="a new key frame when fewer of the corners are still followed"
+    )
     median_frames: int = Field(200, ge=10, description="frames that the temporal median is taken over, evenly spread")
 
 
@@ -55,7 +57,9 @@ def run(frames: Frames, anchored: Tracks, camera: Camera, settings: Registration
     row, col = np.full_like(anchored.row, np.nan), np.full_like(anchored.col, np.nan)
     for target, frame in enumerate(anchor):
         start = np.linalg.pinv(motion[frame]) if np.isfinite(motion[frame]).all() else np.full((3, 3), np.nan)
-        here = np.stack([anchored.col[0, target, :, frame], anchored.row[0, target, :, frame], np.ones(anchored.row.shape[2])])
+        here = np.stack(
+            [anchored.col[0, target, :, frame], anchored.row[0, target, :, frame], np.ones(anchored.row.shape[2])]
+        )
         there = (motion @ start) @ here
         # A target is followed from its anchor to the first lost frame on either side.
         broken = np.flatnonzero(lost)
@@ -113,12 +117,18 @@ def _flattened(frames: Frames, settings: RegistrationSettings) -> Iterator[NDArr
 
 
 def _corners(image: NDArray[np.uint8], settings: RegistrationSettings) -> NDArray[np.float32]:
-    found = cv2.goodFeaturesToTrack(image, settings.corners, settings.corner_quality, settings.corner_distance_px, blockSize=5)
-    return np.empty((0, 1, 2), np.float32) if found is None else found
+    found = cv2.goodFeaturesToTrack(
+        image, settings.corners, settings.corner_quality, settings.corner_distance_px, blockSize=5
+    )
+    return np.empty((0, 1, 2), np.float32) if found is None else found.astype(np.float32)
 
 
 def _similarity(
-    key: NDArray[np.uint8], image: NDArray[np.uint8], corners: NDArray[np.float32], guess: Array, settings: RegistrationSettings
+    key: NDArray[np.uint8],
+    image: NDArray[np.uint8],
+    corners: NDArray[np.float32],
+    guess: Array,
+    settings: RegistrationSettings,
 ) -> Array | None:
     """Similarity (3, 3) from key to image, or None where too few corners agree on one."""
     if len(corners) < settings.least_inliers:
@@ -126,7 +136,13 @@ def _similarity(
     start = (corners.reshape(-1, 2) @ guess[:2, :2].T + guess[:2, 2]).astype(np.float32).reshape(-1, 1, 2)
     size = (settings.window_px, settings.window_px)
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
-        key, image, corners, start.copy(), winSize=size, maxLevel=settings.pyramid_levels, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        key,
+        image,
+        corners,
+        start.copy(),
+        winSize=size,
+        maxLevel=settings.pyramid_levels,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.005),
     )
     height, width = image.shape
@@ -135,8 +151,13 @@ def _similarity(
     if good.sum() < max(settings.least_inliers, settings.kept_fraction * len(corners)):
         return None
     matrix, inliers = cv2.estimateAffinePartial2D(
-        corners[good], moved[good], method=cv2.RANSAC, ransacReprojThreshold=settings.ransac_threshold_px, maxIters=500,
-        confidence=0.999, refineIters=10,
+        corners[good],
+        moved[good],
+        method=cv2.RANSAC,
+        ransacReprojThreshold=settings.ransac_threshold_px,
+        maxIters=500,
+        confidence=0.999,
+        refineIters=10,
     )
     if matrix is None or int(inliers.sum()) < settings.least_inliers:
         return None

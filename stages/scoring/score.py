@@ -25,7 +25,7 @@ class ScoringResult:
 def run(spectra: Spectra) -> ScoringResult:
     """Score one line. A target without reference is not scored; one that is not seen well enough under a method is left
     out of that method's mean and listed in `partly_seen[method]`."""
-    has_reference = np.isfinite(spectra.reference).all(axis=1)
+    has_reference = [bool(np.isfinite(row).all()) for row in spectra.reference]
     scores: dict[str, dict[str, dict[str, Any]]] = {kind: {} for kind in KINDS}
     partly: dict[str, list[str]] = {}
     for kind, name in KINDS.items():

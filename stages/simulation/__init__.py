@@ -1,8 +1,8 @@
 """Simulation: settings and a seed in, a complete campaign with its truth out.
 
-    settings = SimulationSettings.preset("demo")
-    campaign = run(settings, seed=1)
-    write(campaign, Path("out/demo"))            # and out/demo-truth beside it
+settings = SimulationSettings.preset("demo")
+campaign = run(settings, seed=1)
+write(campaign, Path("out/demo"))            # and out/demo-truth beside it
 """
 
 from stages.simulation.files import write

@@ -40,9 +40,7 @@ def calibrate(settings: SimulationSettings, seed: int) -> Calibration:
     )
 
 
-def detect(
-    settings: SimulationSettings, effects: effect.Effects, calibration: Calibration
-) -> tuple[Array, list[str]]:
+def detect(settings: SimulationSettings, effects: effect.Effects, calibration: Calibration) -> tuple[Array, list[str]]:
     """Signal of every material at every pixel (material, row, col) [DN], and the materials' names in order."""
     camera, declared = settings.instrument.camera, settings.instrument.interferometer
     order = list(dict.fromkeys([*calibration.references, *settings.scene.background]))

@@ -12,7 +12,7 @@ from tsmftis.simulator import effects as effect
 from tsmftis.simulator import imaging, interferometer, lens, world
 from tsmftis.simulator.streams import stream
 
-_FRAME_BLOCK = 64          # frames in floating point at a time
+_FRAME_BLOCK = 64  # frames in floating point at a time
 
 
 def image_line(truth: Truth, line: Line) -> SimulatedLine:

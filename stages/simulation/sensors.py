@@ -95,8 +95,7 @@ def draw_sensors(settings: SimulationSettings, effects: effect.Effects, seed: in
     )
     rng = stream(seed, "scale factors")
     errors = inertial.UnitErrors(
-        1e-6 * unit.gyro.scale_factor_sigma_ppm * rng.standard_normal(3)
-        + effect.triple(effects, "gyro_scale_factor"),
+        1e-6 * unit.gyro.scale_factor_sigma_ppm * rng.standard_normal(3) + effect.triple(effects, "gyro_scale_factor"),
         1e-6 * unit.accel.scale_factor_sigma_ppm * rng.standard_normal(3)
         + effect.triple(effects, "accel_scale_factor"),
         np.array(effect.triple(effects, "gyro_g_sensitivity")),

@@ -120,7 +120,7 @@ class Straight(Section):
 
 
 class Turn(Section):
-    turn_deg: float                     # right positive
+    turn_deg: float  # right positive
     bank_deg: Annotated[float, Field(gt=0.0, lt=60.0)]
     climb_m: float = 0.0
 
@@ -190,7 +190,7 @@ class Gnss(Section):
     start_s: NotNegative
     sigma_position_north_east_down_m: NotNegativeTriple
     sigma_velocity_north_east_down_m_per_s: NotNegativeTriple
-    drift_sigma_position_m: NotNegative              # Gauss–Markov, on top and not declared in the file's sigmas
+    drift_sigma_position_m: NotNegative  # Gauss–Markov, on top and not declared in the file's sigmas
     drift_correlation_time_s: Positive
 
 
@@ -236,7 +236,7 @@ class Thermal(Section):
     gyro_bias_deg_per_h: NotNegative
     accel_bias_ug: NotNegative
     time_constant_s: NodeValues
-    time_constant_spread: Annotated[float, Field(ge=0.0, lt=1.0)]       # relative, between axes
+    time_constant_spread: Annotated[float, Field(ge=0.0, lt=1.0)]  # relative, between axes
     self_heating_k: NodeValues
     thermometer_rate_hz: Positive
     thermometer_noise_k: NotNegative
@@ -264,14 +264,14 @@ class TerrainSettings(Section):
     wavelength_m: tuple[Positive, Positive]
     waves: Annotated[int, Field(gt=0)]
     cell_m: Positive
-    margin_m: NotNegative                # beyond what the camera would see of flat ground
+    margin_m: NotNegative  # beyond what the camera would see of flat ground
 
 
 class Scene(Section):
     panel_size_m: Positive
-    panel_margin_m: NotNegative          # kept clear before the first and behind the last panel
-    panel_scatter_m: NotNegative         # across the track, either side
-    background: dict[str, Positive]      # shares of the materials between the panels
+    panel_margin_m: NotNegative  # kept clear before the first and behind the last panel
+    panel_scatter_m: NotNegative  # across the track, either side
+    background: dict[str, Positive]  # shares of the materials between the panels
     contrast: NotNegative
     patch_m: tuple[Positive, Positive]
     cell_m: Positive
@@ -286,7 +286,7 @@ class Scene(Section):
 
 
 class Light(Section):
-    radiance_scale: Positive             # reference radiance unit of a perfect reflector where sunlight peaks
+    radiance_scale: Positive  # reference radiance unit of a perfect reflector where sunlight peaks
     wavenumber_start_per_m: Positive
     wavenumber_stop_per_m: Positive
     wavenumber_step_per_m: Positive
@@ -298,14 +298,14 @@ class Detector(Section):
     response_width_nm: Positive
     response_edge_per_m: Positive
     visibility: Annotated[float, Field(gt=0.0, le=1.0)]
-    phase_rad: list[float]               # of powers of wavenumber scaled to −1 … 1
+    phase_rad: list[float]  # of powers of wavenumber scaled to −1 … 1
     dark_dn: NotNegative
     dark_sigma_dn: NotNegative
-    vignetting: Annotated[float, Field(ge=0.0, lt=1.0)]       # loss in the corners
+    vignetting: Annotated[float, Field(ge=0.0, lt=1.0)]  # loss in the corners
     pixel_gain_sigma: NotNegative
     electrons_per_dn: Positive
     read_noise_dn: NotNegative
-    exposure_s: NotNegative              # zero freezes the motion
+    exposure_s: NotNegative  # zero freezes the motion
     exposure_instants: Annotated[int, Field(gt=0)]
 
 

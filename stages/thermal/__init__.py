@@ -1,6 +1,6 @@
 """Thermal stage: chamber runs → a model of bias against temperature, verified on runs it has never seen.
 
-    run(train, verify, settings) → ThermalResult;   result.model.correction(temperatures) → what to take off a flight
+run(train, verify, settings) → ThermalResult;   result.model.correction(temperatures) → what to take off a flight
 """
 
 from __future__ import annotations
@@ -38,7 +38,10 @@ def run(train: Sequence[Chamber], verify: Sequence[Chamber], settings: ThermalSe
     """Train on the chamber runs `train`, and see on `verify` what is left."""
     if not train:
         raise InputError(
-            "campaign.yaml", "thermal.train", "names no chamber run", "name at least one, or leave 'thermal' out",
+            "campaign.yaml",
+            "thermal.train",
+            "names no chamber run",
+            "name at least one, or leave 'thermal' out",
         )
     if settings.device == "cuda" and not torch.cuda.is_available():
         raise InputError("settings", "thermal.device", "is 'cuda' where torch finds no such device", "set it to 'cpu'")

@@ -29,7 +29,9 @@ Array = NDArray[np.float64]
 SCHEMA = "tsmftis-thermal-model/1"
 METHODS = ("polynomial", "rbf", "bayesian_rbf")
 PREDICTORS: dict[str, type[Any]] = {
-    "polynomial": Polynomial, "rbf": TraditionalRbf, "bayesian_rbf": BayesianRbf,
+    "polynomial": Polynomial,
+    "rbf": TraditionalRbf,
+    "bayesian_rbf": BayesianRbf,
 }
 UNITS = ("rad s-1", "m s-2")
 
@@ -90,7 +92,8 @@ class ThermalModel:
         for name, channel, feature in zip(CHANNELS, self.channels, made, strict=True):
             if feature.shape[1] < len(channel.used):
                 raise InputError(
-                    "thermal model", f"channel {name}",
+                    "thermal model",
+                    f"channel {name}",
                     "was trained with three thermometers where the readings have one",
                     "apply it to readings of the same thermometers, or train on a chamber run with one",
                 )
@@ -121,7 +124,9 @@ class ThermalModel:
             for key in ("used", "mean", "scale", "low", "high"):
                 value = getattr(channel, key)
                 variables[f"{name}_{key}"] = (
-                    (f"{name}_feature",), value.astype(np.float64), {"long_name": ", ".join(NAMES[: len(value)])},
+                    (f"{name}_feature",),
+                    value.astype(np.float64),
+                    {"long_name": ", ".join(NAMES[: len(value)])},
                 )
             variables[f"{name}_prior_sigma"] = ((), channel.prior_sigma, {"units": unit})
             for method, predictor in channel.predictors.items():
@@ -129,10 +134,16 @@ class ThermalModel:
                     shape = np.shape(value)
                     dims = tuple(f"{name}_{method}_{key}_{axis}" for axis in range(len(shape)))
                     variables[f"{name}_{method}_{key}"] = (dims, np.asarray(value, dtype=np.float64), {})
-        return xr.Dataset(variables, attrs={
-            "schema": SCHEMA, "smoothing_s": self.smoothing_s, "causal": int(self.causal), "block_s": self.block_s,
-            "minimum_span_k": self.minimum_span_k,
-        })
+        return xr.Dataset(
+            variables,
+            attrs={
+                "schema": SCHEMA,
+                "smoothing_s": self.smoothing_s,
+                "causal": int(self.causal),
+                "block_s": self.block_s,
+                "minimum_span_k": self.minimum_span_k,
+            },
+        )
 
     @classmethod
     def from_file(cls, path: Path) -> ThermalModel:
@@ -142,13 +153,18 @@ class ThermalModel:
             attributes = dict(d.attrs)
         if attributes.get("schema") != SCHEMA:
             raise InputError(
-                path, "attribute 'schema'", f"is {attributes.get('schema')!r} where {SCHEMA!r} is expected",
+                path,
+                "attribute 'schema'",
+                f"is {attributes.get('schema')!r} where {SCHEMA!r} is expected",
                 "train the model again",
             )
         try:
             return cls(
-                tuple(_read_channel(name, variables) for name in CHANNELS), float(attributes["smoothing_s"]),
-                bool(attributes["causal"]), float(attributes["block_s"]), float(attributes["minimum_span_k"]),
+                tuple(_read_channel(name, variables) for name in CHANNELS),
+                float(attributes["smoothing_s"]),
+                bool(attributes["causal"]),
+                float(attributes["block_s"]),
+                float(attributes["minimum_span_k"]),
             )
         except KeyError as error:
             raise InputError(path, f"entry {error}", "is missing", "train the model again") from error
@@ -171,5 +187,11 @@ def _read_channel(name: str, variables: dict[str, NDArray[Any]]) -> ChannelModel
             predictors[method] = kind(**numbers)
     of = {key: variables[f"{name}_{key}"] for key in ("used", "mean", "scale", "low", "high", "prior_sigma")}
     return ChannelModel(
-        of["used"].astype(bool), of["mean"], of["scale"], of["low"], of["high"], float(of["prior_sigma"]), predictors,
+        of["used"].astype(bool),
+        of["mean"],
+        of["scale"],
+        of["low"],
+        of["high"],
+        float(of["prior_sigma"]),
+        predictors,
     )

@@ -204,9 +204,19 @@ def fit_network(
         evidence = log_evidence(phi, y, tensor(np.log(final.alpha)), tensor(np.log(final.beta)))
         mixing = torch.linalg.inv(_cholesky(c, q[:dimensions])).T
     return BayesianRbf(
-        centres=middle, widths=np.exp(best.x[:dimensions]),
-        low=features.min(axis=0) - LINEAR_MARGIN, high=features.max(axis=0) + LINEAR_MARGIN,
-        mixing=mixing.cpu().numpy(), weights=final.weights.cpu().numpy(), factor=final.factor.cpu().numpy(),
-        alpha=final.alpha, beta=final.beta, gamma=final.gamma, ratio=float(q[dimensions].exp()),
-        constant=constant, scale=scale, count=len(target), log_evidence=float(evidence) - len(target) * math.log(scale),
+        centres=middle,
+        widths=np.exp(best.x[:dimensions]),
+        low=features.min(axis=0) - LINEAR_MARGIN,
+        high=features.max(axis=0) + LINEAR_MARGIN,
+        mixing=mixing.cpu().numpy(),
+        weights=final.weights.cpu().numpy(),
+        factor=final.factor.cpu().numpy(),
+        alpha=final.alpha,
+        beta=final.beta,
+        gamma=final.gamma,
+        ratio=float(q[dimensions].exp()),
+        constant=constant,
+        scale=scale,
+        count=len(target),
+        log_evidence=float(evidence) - len(target) * math.log(scale),
     )

@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 CHANNELS = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 
 # Far above what any thermal bias does over a run and far below what a hand that moves the unit does.
-MOTION_RATE = 0.02              # rad/s
-MOTION_FORCE = 0.5              # m/s²
+MOTION_RATE = 0.02  # rad/s
+MOTION_FORCE = 0.5  # m/s²
 
 
 def bias_samples(chamber: Chamber) -> Array:
@@ -91,8 +91,12 @@ def thinned(chamber: Chamber, seconds: float, step: float) -> Chamber:
     t = chamber.temperatures
     time = mean(chamber.time)
     return replace(
-        chamber, time=time, gyro=mean(chamber.gyro), accel=mean(chamber.accel),
-        temperatures=replace(t, time=time, gyro=mean(t.gyro), accel=mean(t.accel)), temperature_chamber=None,
+        chamber,
+        time=time,
+        gyro=mean(chamber.gyro),
+        accel=mean(chamber.accel),
+        temperatures=replace(t, time=time, gyro=mean(t.gyro), accel=mean(t.accel)),
+        temperature_chamber=None,
     )
 
 
@@ -106,7 +110,8 @@ def refuse_motion(chamber: Chamber, seconds: float) -> None:
     if moved.size:
         block, channel = moved[0]
         raise InputError(
-            where, f"channel {CHANNELS[channel]}",
+            where,
+            f"channel {CHANNELS[channel]}",
             f"changes by {abs(means[block, channel] - middle[channel]):.3g} {'rad/s' if channel < 3 else 'm/s²'} "
             f"near second {chamber.time[0] + block * seconds:.0f}: the unit was moved",
             "give only the static part of the run",
@@ -114,7 +119,8 @@ def refuse_motion(chamber: Chamber, seconds: float) -> None:
     off = np.abs(middle - expected_reading(chamber))[3:]
     if (off > MOTION_FORCE).any():
         raise InputError(
-            where, "attributes roll_deg, pitch_deg, yaw_deg",
+            where,
+            "attributes roll_deg, pitch_deg, yaw_deg",
             f"gravity misses the accelerometers' median by {off.max():.3g} m/s²",
             "give the attitude of the sensor triad (NED, roll and pitch zero with z down), or leave the attitude out",
         )

@@ -58,7 +58,8 @@ def training_set(train: Sequence[Chamber], settings: ThermalSettings) -> Trainin
     targets = np.vstack(bias)
     if len(targets) < FEWEST_BLOCKS:
         raise InputError(
-            f"chamber run {', '.join(c.name for c in train)}", "duration",
+            f"chamber run {', '.join(c.name for c in train)}",
+            "duration",
             f"gives {len(targets)} blocks of {settings.block_s:g} s where {FEWEST_BLOCKS} are needed",
             "give a longer run or a smaller thermal.block_s",
         )
@@ -82,8 +83,12 @@ def fit_channel(features: Array, bias: Array, settings: ThermalSettings, teach: 
             "polynomial": fit_polynomial(x, bias, settings.polynomial_degrees),
             "rbf": fit_traditional_rbf(x, bias, settings.rbf_nodes, settings.rbf_widths, settings.seed),
             "bayesian_rbf": fit_network(
-                x, bias, centres=settings.centres, start_widths=settings.start_widths,
-                iterations=settings.iterations, device=settings.device,
+                x,
+                bias,
+                centres=settings.centres,
+                start_widths=settings.start_widths,
+                iterations=settings.iterations,
+                device=settings.device,
             ),
         }
     return ChannelModel(used, mean, scale, low - margin, high + margin, prior, predictors)
@@ -105,7 +110,9 @@ def fit_model(
     ]
     notes += [
         f"Chamber run {c.name} has no attitude: its own mean is the reference, so only the change of bias with "
-        "temperature is learnt." for c in train if c.attitude is None
+        "temperature is learnt."
+        for c in train
+        if c.attitude is None
     ]
     for i, name in enumerate(CHANNELS):
         if data.refused[i]:
@@ -120,10 +127,19 @@ def fit_model(
                 f"Channel {name}: what the network leaves of one block correlates with the next by {correlation:.2f}: "
                 "the noise is coloured or the bias has a memory, and the stated sigmas are too small."
             )
-        table.append({
-            "channel": name, "n": network.count, "m": len(network.weights), "alpha": network.alpha,
-            "beta": network.beta, "gamma": network.gamma, "log_evidence": network.log_evidence,
-            "widths": network.widths.tolist(),
-            "linear_ratio": network.ratio, "noise_sigma": network.noise_sigma, "residual_correlation": correlation,
-        })
+        table.append(
+            {
+                "channel": name,
+                "n": network.count,
+                "m": len(network.weights),
+                "alpha": network.alpha,
+                "beta": network.beta,
+                "gamma": network.gamma,
+                "log_evidence": network.log_evidence,
+                "widths": network.widths.tolist(),
+                "linear_ratio": network.ratio,
+                "noise_sigma": network.noise_sigma,
+                "residual_correlation": correlation,
+            }
+        )
     return model, table, notes

@@ -17,8 +17,8 @@ from tsmftis.geodesy import STANDARD_GRAVITY
 
 Array = NDArray[np.float64]
 
-DEG_PER_H = float(np.rad2deg(3600.0))           # of 1 rad/s
-MICRO_G = 1e6 / STANDARD_GRAVITY                # of 1 m/s²
+DEG_PER_H = float(np.rad2deg(3600.0))  # of 1 rad/s
+MICRO_G = 1e6 / STANDARD_GRAVITY  # of 1 m/s²
 
 
 def verify_run(model: ThermalModel, chamber: Chamber, seconds: float) -> dict[str, Any]:
@@ -48,8 +48,12 @@ def verify_run(model: ThermalModel, chamber: Chamber, seconds: float) -> dict[st
     temperature = np.column_stack([chamber.temperatures.gyro.mean(axis=2), chamber.temperatures.accel])
     on_time = np.column_stack([np.interp(chamber.time, chamber.temperatures.time, t) for t in temperature.T])
     return {
-        "name": chamber.name, "time_s": means(chamber.time[:, None])[:, 0], "temperature_degc": means(on_time),
-        "raw": raw, "left": left, "sigma": sigma,
+        "name": chamber.name,
+        "time_s": means(chamber.time[:, None])[:, 0],
+        "temperature_degc": means(on_time),
+        "raw": raw,
+        "left": left,
+        "sigma": sigma,
         "distance": means(np.column_stack([c.distance(f) for c, f in zip(model.channels, features, strict=True)])),
     }
 

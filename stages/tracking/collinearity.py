@@ -21,7 +21,7 @@ from tsmftis.rotation import Attitude, rpy_to_dcm
 
 Array = NDArray[np.float64]
 
-MARGIN_S = 0.25         # trajectory kept beyond the line's ends, so that the splines have no end inside it
+MARGIN_S = 0.25  # trajectory kept beyond the line's ends, so that the splines have no end inside it
 
 
 class TrackingSettings(BaseModel):
@@ -29,7 +29,9 @@ class TrackingSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    farthest_target_m: float = Field(50_000.0, gt=0, description="a target farther from the line than this is an error in its coordinates")
+    farthest_target_m: float = Field(
+        50_000.0, gt=0, description="a target farther from the line than this is an error in its coordinates"
+    )
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,12 @@ class TrackingResult:
 
 
 def run(
-    trajectory: Trajectory, stamps: Array, targets: Targets, camera: Camera, mounting: Mounting, settings: TrackingSettings
+    trajectory: Trajectory,
+    stamps: Array,
+    targets: Targets,
+    camera: Camera,
+    mounting: Mounting,
+    settings: TrackingSettings,
 ) -> TrackingResult:
     """Tracks of every point of every target through the frames with these time stamps [s].
 
@@ -55,8 +62,10 @@ def run(
     inside = np.isfinite(poses.centre[:, 0])
     if inside.sum() < 2:
         raise InputError(
-            "frames", "variable 'time'",
-            f"spans {time[0]:.2f} to {time[-1]:.2f} s but the trajectory {trajectory.time[0]:.2f} to {trajectory.time[-1]:.2f} s: no frame lies inside it",
+            "frames",
+            "variable 'time'",
+            f"spans {time[0]:.2f} to {time[-1]:.2f} s but the trajectory {trajectory.time[0]:.2f} to "
+            f"{trajectory.time[-1]:.2f} s: no frame lies inside it",
             "frames and IMU must share the campaign's one clock",
         )
     course, speed = mean_course(trajectory, float(time[inside][0]), float(time[inside][-1]))
@@ -65,7 +74,10 @@ def run(
     if (distance > settings.farthest_target_m).any():
         i = int(np.argmax(distance))
         raise InputError(
-            "targets", f"target {targets.ids[i]}", f"lies {distance[i] / 1000:.0f} km from the line", "latitude and longitude may be swapped: correct them",
+            "targets",
+            f"target {targets.ids[i]}",
+            f"lies {distance[i] / 1000:.0f} km from the line",
+            "latitude and longitude may be swapped: correct them",
         )
     row, col = project(points, poses, camera)
     nominal = nominal_track(row, col, time, camera, speed, float(np.nanmean(distance_down(points, poses))))
@@ -86,11 +98,11 @@ def camera_poses(trajectory: Trajectory, time: Array, mounting: Mounting) -> Cam
             part.velocity[:, 1] / ((east + part.height) * np.cos(part.latitude)),
             -part.velocity[:, 2],
         )
-        position = [
+        latitude, longitude, height = (
             CubicHermiteSpline(part.time, v, r)(time[inside])
             for v, r in zip((part.latitude, part.longitude, part.height), rates, strict=True)
-        ]
-        centre[inside], dcm[inside] = camera_pose(*position, attitude(time[inside]), mounting)
+        )
+        centre[inside], dcm[inside] = camera_pose(latitude, longitude, height, attitude(time[inside]), mounting)
     return CameraPoses(time, centre, dcm)
 
 
@@ -125,7 +137,9 @@ def distance_down(points: Array, poses: CameraPoses) -> Array:
     return camera_height - height[:, None]
 
 
-def nominal_track(row: Array, col: Array, time: Array, camera: Camera, speed: float, height: float) -> tuple[Array, Array]:
+def nominal_track(
+    row: Array, col: Array, time: Array, camera: Camera, speed: float, height: float
+) -> tuple[Array, Array]:
     """Uniform straight motion from the anchor frame: col += v·Δt·f/(p·H) a frame, row unchanged; no attitude."""
     anchor = camera.central_frame(row[:, Tracks.CENTRE], col[:, Tracks.CENTRE])
     pixels = speed * camera.focal_length / (camera.pixel_pitch * height) * (time - time[anchor][:, None])

@@ -28,8 +28,8 @@ from tsmftis.simulator.harmonics import Harmonics
 
 Array = NDArray[np.float64]
 
-KNOT_INTERVAL = 0.5        # s: far below a turn's time, far above where rounding of 1e-9 m shows in acceleration
-_FINE = 50                 # integration steps a knot interval
+KNOT_INTERVAL = 0.5  # s: far below a turn's time, far above where rounding of 1e-9 m shows in acceleration
+_FINE = 50  # integration steps a knot interval
 
 
 @dataclass(frozen=True)

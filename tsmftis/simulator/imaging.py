@@ -30,7 +30,7 @@ from tsmftis.simulator.world import Panels, Plane, Terrain, Texture
 
 Array = NDArray[np.float64]
 
-FLEXURE_CUTOFF = 12.0      # Hz
+FLEXURE_CUTOFF = 12.0  # Hz
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def _distance(px, py, pz, dx, dy, dz, height, north, west, d_lat, d_lon, guess):
         ground = (1.0 - fr) * ((1.0 - fc) * height[i, j] + fc * height[i, j + 1]) + fr * (
             (1.0 - fc) * height[i + 1, j] + fc * height[i + 1, j + 1]
         )
-        up = (dx * x + dy * y) / p * lat_c + dz * lat_s      # climb of the ray per metre, negative
+        up = (dx * x + dy * y) / p * lat_c + dz * lat_s  # climb of the ray per metre, negative
         if up >= -0.1:
             return np.nan
         change = (ground - h) / up
@@ -118,8 +118,18 @@ def _cast(position, direction, height, north, west, d_lat, d_lon, guess):  # typ
     out = np.empty(len(position))
     for i in numba.prange(len(position)):
         out[i] = _distance(
-            position[i, 0], position[i, 1], position[i, 2], direction[i, 0], direction[i, 1], direction[i, 2],
-            height, north, west, d_lat, d_lon, guess[i],
+            position[i, 0],
+            position[i, 1],
+            position[i, 2],
+            direction[i, 0],
+            direction[i, 1],
+            direction[i, 2],
+            height,
+            north,
+            west,
+            d_lat,
+            d_lon,
+            guess[i],
         )
     return out
 
@@ -128,8 +138,14 @@ def cast(position: Array, direction: Array, terrain: Terrain) -> Array:
     """ECEF points (n, 3) where rays from position (n, 3) along unit directions (n, 3) meet the terrain, or NaN."""
     _, _, height = geodesy.ecef_to_geodetic(position)
     distance = _cast(
-        np.ascontiguousarray(position), np.ascontiguousarray(direction), terrain.height, terrain.north, terrain.west,
-        terrain.d_latitude, terrain.d_longitude, height - float(terrain.height.mean()),
+        np.ascontiguousarray(position),
+        np.ascontiguousarray(direction),
+        terrain.height,
+        terrain.north,
+        terrain.west,
+        terrain.d_latitude,
+        terrain.d_longitude,
+        height - float(terrain.height.mean()),
     )
     return position + distance[:, None] * direction
 
@@ -160,13 +176,26 @@ def expose(
     _, _, height = geodesy.ecef_to_geodetic(position)
     terrain, panels, texture = scene.terrain, scene.panels, scene.texture
     frames = _expose(
-        np.ascontiguousarray(position), np.ascontiguousarray(to_ecef), corner,
-        terrain.height, terrain.north, terrain.west, terrain.d_latitude, terrain.d_longitude,
+        np.ascontiguousarray(position),
+        np.ascontiguousarray(to_ecef),
+        corner,
+        terrain.height,
+        terrain.north,
+        terrain.west,
+        terrain.d_latitude,
+        terrain.d_longitude,
         np.ascontiguousarray(height - float(terrain.height.mean())),
-        scene.plane.origin, np.stack([scene.plane.along, scene.plane.across]),
-        panels.centre, 0.5 * panels.side, panels.material,
-        texture.abundance, texture.corner, texture.cell, scene.background,
-        signal, samples,
+        scene.plane.origin,
+        np.stack([scene.plane.along, scene.plane.across]),
+        panels.centre,
+        0.5 * panels.side,
+        panels.material,
+        texture.abundance,
+        texture.corner,
+        texture.cell,
+        scene.background,
+        signal,
+        samples,
     )
     if np.isnan(frames).any():
         raise ValueError("a ray leaves the terrain: the line is not flown level, or terrain.margin_m is too small")
@@ -175,8 +204,26 @@ def expose(
 
 @numba.njit(parallel=True, cache=True)
 def _expose(  # type: ignore[no-untyped-def]
-    position, to_ecef, corner, height, north, west, d_lat, d_lon, guess, origin, axes, centre, half, material,
-    abundance, texture_corner, cell, background, signal, samples,
+    position,
+    to_ecef,
+    corner,
+    height,
+    north,
+    west,
+    d_lat,
+    d_lon,
+    guess,
+    origin,
+    axes,
+    centre,
+    half,
+    material,
+    abundance,
+    texture_corner,
+    cell,
+    background,
+    signal,
+    samples,
 ):
     frames, instants = position.shape[:2]
     rows, cols = corner.shape[0] - 1, corner.shape[1] - 1
@@ -212,8 +259,10 @@ def _expose(  # type: ignore[no-untyped-def]
                     near = -1
                     for q in range(centre.shape[0]):
                         if (
-                            low_a <= centre[q, 0] + half[q] and high_a >= centre[q, 0] - half[q]
-                            and low_b <= centre[q, 1] + half[q] and high_b >= centre[q, 1] - half[q]
+                            low_a <= centre[q, 0] + half[q]
+                            and high_a >= centre[q, 0] - half[q]
+                            and low_b <= centre[q, 1] + half[q]
+                            and high_b >= centre[q, 1] - half[q]
                         ):
                             near = q
                     total = 0.0

@@ -34,8 +34,8 @@ from tsmftis.simulator.flight import Flight
 Array = NDArray[np.float64]
 
 EARTH_ROTATION = np.array([0.0, 0.0, geodesy.EARTH_RATE])
-_NODES = 4                 # exact to degree 7 in an interval: a 50 Hz vibration sampled at 200 Hz to 1e-7 of itself
-_BLOCK = 16384             # intervals worked on at a time
+_NODES = 4  # exact to degree 7 in an interval: a 50 Hz vibration sampled at 200 Hz to 1e-7 of itself
+_BLOCK = 16384  # intervals worked on at a time
 
 
 def gravitation(position: Array) -> Array:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-NONLINEARITY_SIGNAL = 12000.0       # DN, the signal at which the loss is the fraction a
-_BLOCK = 2048                       # path differences transformed at a time
+NONLINEARITY_SIGNAL = 12000.0  # DN, the signal at which the loss is the fraction a
+_BLOCK = 2048  # path differences transformed at a time
 
 
 def path_difference(

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_SECOND_RADIATION = 1.438777e-2       # hc/k [m K]
-_SUN = 5778.0                         # K
+_SECOND_RADIATION = 1.438777e-2  # hc/k [m K]
+_SUN = 5778.0  # K
 # Absorption of the clear sky at sea level: centre [nm], width [nm], depth; Fraunhofer lines, ozone, oxygen, water.
 _ABSORPTION = (
     (486.1, 1.5, 0.10),
@@ -53,12 +53,12 @@ def _peak(wavelength: Array, centre: float, width: float, height: float) -> Arra
 def illumination(wavenumber: Array) -> Array:
     """Sunlight on the ground per unit wavenumber: Planck's σ³/(e^{c₂σ/T} − 1) at 5778 K, peak 1, through the sky."""
     planck = wavenumber**3 / np.expm1(_SECOND_RADIATION * wavenumber / _SUN)
-    peak = 2.8214393721 * _SUN / _SECOND_RADIATION     # Wien's law per unit wavenumber
+    peak = 2.8214393721 * _SUN / _SECOND_RADIATION  # Wien's law per unit wavenumber
     light = planck / (peak**3 / np.expm1(_SECOND_RADIATION * peak / _SUN))
     wavelength = 1e9 / wavenumber
     for centre, width, depth in _ABSORPTION:
         light = light * _dip(wavelength, centre, width, depth)
-    return light * np.exp(-0.12 * (550.0 / wavelength) ** 4)     # Rayleigh scattering, one vertical pass
+    return light * np.exp(-0.12 * (550.0 / wavelength) ** 4)  # Rayleigh scattering, one vertical pass
 
 
 _REFLECTANCE: dict[str, Callable[[Array], Array]] = {
@@ -68,8 +68,14 @@ _REFLECTANCE: dict[str, Callable[[Array], Array]] = {
     "red": lambda w: 0.06 + 0.80 * _edge(w, 605.0, 18.0),
     "green": lambda w: 0.06 + _peak(w, 535.0, 28.0, 0.55) + 0.40 * _edge(w, 800.0, 30.0),
     "blue": lambda w: 0.06 + _peak(w, 468.0, 30.0, 0.65) + 0.25 * _edge(w, 860.0, 25.0),
-    "holmium": lambda w: 0.85 * _dip(w, 454.0, 5.0, 0.45) * _dip(w, 486.0, 4.0, 0.30) * _dip(w, 537.0, 5.0, 0.25)
-    * _dip(w, 640.0, 6.0, 0.22) * _dip(w, 890.0, 8.0, 0.10),
+    "holmium": lambda w: (
+        0.85
+        * _dip(w, 454.0, 5.0, 0.45)
+        * _dip(w, 486.0, 4.0, 0.30)
+        * _dip(w, 537.0, 5.0, 0.25)
+        * _dip(w, 640.0, 6.0, 0.22)
+        * _dip(w, 890.0, 8.0, 0.10)
+    ),
     "grass": lambda w: 0.035 + _peak(w, 552.0, 30.0, 0.07) + 0.42 * _edge(w, 718.0, 18.0),
     "soil": lambda w: 0.05 + 0.26 * (w / 900.0) ** 1.6 * _dip(w, 870.0, 60.0, 0.08),
     "asphalt": lambda w: 0.07 + 0.05 * (w - 400.0) / 600.0,
