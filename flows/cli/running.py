@@ -44,7 +44,7 @@ def run(
     ] = None,
     settings_file: Annotated[
         Path | None,
-        typer.Option("--settings", metavar="FILE", help="YAML file of settings (configs/settings.yaml lists all)."),
+        typer.Option("--settings", metavar="FILE", help="YAML file of settings (`tsmftis settings` prints one)."),
     ] = None,
 ) -> None:
     """Process a campaign. Only what changed since the last run into the same folder runs again.

@@ -49,7 +49,7 @@ ELEMENTS = 2_000_000  # of a table in memory at once
 class BenchSettings(BaseModel):
     """What overrides the file's own parameters; None leaves them."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     apodization: str | None = None
     phase_correction: PhaseCorrection | None = None

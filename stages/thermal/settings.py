@@ -16,7 +16,7 @@ class ThermalSettings(BaseModel):
     Times are time constants in seconds, never samples, so that chamber and flight are treated alike at any sampling.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     block_s: Positive = 60.0
     """Targets are means over this time: short against the thermal time constants, long against the noise."""
