@@ -60,7 +60,8 @@ def main() -> None:
                 print(f"  {kind}: " + ", ".join(f"{m} {v:.4f}" for m, v in run[kind].items()))
             if (truth / "yardstick.json").exists():
                 yard = json.loads((truth / "yardstick.json").read_text())
-                print(f"  true pose (independent program): rqe {yard['rqe']['mean']:.4f}, rqe_area {yard['rqe_area']['mean']:.4f}")
+                means = ", ".join(f"{kind} {yard[kind]['mean']:.4f}" for kind in ("rqe", "rqe_area"))
+                print(f"  true pose (independent program): {means}")
             if (truth / "trajectory.npz").exists():
                 errors = trajectory_errors(truth, Path(folder))
                 print("  trajectory inside the lines, RMS: " + ", ".join(f"{n} {v:.5f}" for n, v in errors.items()))

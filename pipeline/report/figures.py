@@ -36,6 +36,11 @@ def layout(figure: go.Figure, height: int, title: str | None = None) -> go.Figur
     return figure
 
 
+def _stroke(method: str, width: float) -> dict[str, Any]:
+    """A method's line; registration is dashed, so that tracking shows where both agree."""
+    return {"color": COLOURS.get(method), "width": width, "dash": "dash" if method == "registration" else "solid"}
+
+
 def thin(*series: Array) -> list[list[float]]:
     """Series of one length, every k-th value, so that the page stays light."""
     step = max(1, len(series[0]) // MOST_POINTS)
@@ -129,9 +134,9 @@ def navigation_quality(
     for row, name in enumerate(("σ position [m]", "σ attitude [°]", "fix − path [m]", "NIS of fixes [1]"), start=1):
         figure.update_yaxes(title=name, row=row, col=1)
     _shade(figure, lines)
-    figure.update_yaxes(type="log", row=4, col=1)
-    figure.update_yaxes(type="log", row=2, col=1)
-    figure.update_yaxes(type="log", row=1, col=1)
+    figure.update_yaxes(type="log", exponentformat="none", row=4, col=1)
+    figure.update_yaxes(type="log", exponentformat="none", row=2, col=1)
+    figure.update_yaxes(type="log", exponentformat="none", row=1, col=1)
     figure.update_xaxes(title="time [s after the epoch]", row=4, col=1)
     return layout(figure, 760)
 
@@ -226,7 +231,7 @@ def tracks_over_frame(frames: Frames, tracks: Tracks) -> go.Figure:
             inside = np.isfinite(col) & (col > -1) & (col < cols) & (row > -1) & (row < rows)
             x += [*np.round(col[inside], 2).tolist(), None]
             y += [*np.round(row[inside], 2).tolist(), None]
-        figure.add_scatter(x=x, y=y, mode="lines", name=method, line={"color": COLOURS.get(method), "width": 1.5})
+        figure.add_scatter(x=x, y=y, mode="lines", name=method, line=_stroke(method, 1.8))
     for t, name in enumerate(tracks.targets):
         m = tracks.methods.index("tracking") if "tracking" in tracks.methods else 0
         row, col = tracks.row[m, t, Tracks.CENTRE, middle], tracks.col[m, t, Tracks.CENTRE, middle]
@@ -296,7 +301,7 @@ def spectra(record: Spectra, area: bool) -> go.Figure:
                 name=method,
                 legendgroup=method,
                 showlegend=t == 0,
-                line={"color": COLOURS.get(method), "width": 1.3},
+                line=_stroke(method, 1.4),
                 **at,
             )
         figure.update_xaxes(title="wavelength [nm]" if t // columns == rows - 1 else None, **at)
