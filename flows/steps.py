@@ -313,7 +313,7 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
             [float(c) for c in str(Spectra.from_file(folder / "spectra.nc").attributes["phase_coefficients"]).split()]
         )
         wavenumber = interferometer.scored_wavenumbers(settings.wavenumber_step_per_m)
-        phase = np.interp(wavenumber, scored, smooth_phase(coefficients, scored))
+        phase = smooth_phase(coefficients, wavenumber, (scored[0], scored[-1]))
         quicklook = _Quicklook(grid.shape, wavenumber)
         with open_cube(to["cube"], grid.crs, Affine(*grid.affine), grid.shape, 1e9 / wavenumber) as cube:
             for start, strip in mapping.run(

@@ -40,18 +40,19 @@ def correct(
 
 
 def noise_out_of_band(
-    interferogram: Array, gain: Array, opd: Array, shortest_wavelength: float, longest_wavelength: float
+    interferogram: Array, gain: Array, opd: Array, lowest_wavenumber: float, highest_wavenumber: float
 ) -> Array:
     """Variance of one pixel (...,) from interferograms (..., n) and their noise gains (..., n), opd (n,).
 
-    E|Σ w·I·dx·e^{−2πiσx}|² = var·Σ w²·gain·dx² at a wavenumber without light. The band lies between 1/λ_low and Nyquist
-    if that is at least three line widths, else between 0.3 and 0.9 of 1/λ_high (there the scene's own texture counts in).
+    E|Σ w·I·dx·e^{−2πiσx}|² = var·Σ w²·gain·dx² at a wavenumber without light. The band lies between the highest
+    wavenumber with light and Nyquist if that is at least three line widths wide, else between 0.3 and 0.9 of the lowest one
+    (there the scene's own texture counts in).
     """
     span = float(np.ptp(opd))
     nyquist = 0.5 / float(np.median(np.abs(np.diff(opd))))
-    low, high = 1.0 / shortest_wavelength + 2.0 / span, nyquist - 0.5 / span
+    low, high = highest_wavenumber + 2.0 / span, nyquist - 0.5 / span
     if high - low < 3.0 / span:
-        low, high = 0.3 / longest_wavelength, 0.9 / longest_wavelength
+        low, high = 0.3 * lowest_wavenumber, 0.9 * lowest_wavenumber
     band = np.arange(low, high, 0.5 / span)
     window = apodization("connes", 2.0 * (opd - opd.min()) / span - 1.0)
     power = np.abs(transform(interferogram, opd, window, band)) ** 2

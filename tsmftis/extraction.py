@@ -122,39 +122,39 @@ def shared_gain(row: Any, col: Any, chosen: Any, crossings: Any, rows: int, out:
     """
     points, frames = row.shape
     cols = crossings.shape[1]
-    size = 0
-    for c in range(cols):
-        size = max(size, 4 * int(crossings[:, c].sum()))
-    keys = np.empty((cols, size), np.int64)
-    weights = np.empty((cols, size))
-    filled = np.zeros(cols, np.int64)
-    number = 0
-    for p in range(points):
-        number += chosen[p]
-    for p in range(points):
-        if not chosen[p]:
-            continue
-        for i in range(frames - 1):
-            r0, c0, r1, c1 = row[p, i], col[p, i], row[p, i + 1], col[p, i + 1]
-            if not (np.isfinite(c0) and np.isfinite(c1)) or c0 == c1:
+    # Crossings by geometry alone: where a bad pixel took some of a column's away, the weights still share out over all.
+    crossed = np.zeros((points, cols))
+    for collect in range(2):
+        if collect == 1:
+            size = 4 * int(crossed.sum(axis=0).max())
+            keys, weights = np.empty((cols, size), np.int64), np.empty((cols, size))
+            filled = np.zeros(cols, np.int64)
+        for p in range(points):
+            if not chosen[p]:
                 continue
-            if not (r0 >= 0.0 and r0 <= rows - 1 and r1 >= 0.0 and r1 <= rows - 1):
-                continue
-            start, stop = _columns(c0, c1, cols)
-            a, b = min(int(r0), rows - 2), min(int(r1), rows - 2)
-            u, v = r0 - a, r1 - b
-            for c in range(start, stop + 1):
-                n = filled[c]
-                # A crossing that met a bad pixel was not counted: leave it out here too.
-                if crossings[p, c] == 0 or n + 4 > size:
+            for i in range(frames - 1):
+                r0, c0, r1, c1 = row[p, i], col[p, i], row[p, i + 1], col[p, i + 1]
+                if not (np.isfinite(c0) and np.isfinite(c1)) or c0 == c1:
                     continue
-                tau = (c - c0) / (c1 - c0)
-                scale = 1.0 / (crossings[p, c] * number)
-                keys[c, n], weights[c, n] = i * rows + a, scale * (1.0 - tau) * (1.0 - u)
-                keys[c, n + 1], weights[c, n + 1] = i * rows + a + 1, scale * (1.0 - tau) * u
-                keys[c, n + 2], weights[c, n + 2] = (i + 1) * rows + b, scale * tau * (1.0 - v)
-                keys[c, n + 3], weights[c, n + 3] = (i + 1) * rows + b + 1, scale * tau * v
-                filled[c] = n + 4
+                if not (r0 >= 0.0 and r0 <= rows - 1 and r1 >= 0.0 and r1 <= rows - 1):
+                    continue
+                start, stop = _columns(c0, c1, cols)
+                a, b = min(int(r0), rows - 2), min(int(r1), rows - 2)
+                u, v = r0 - a, r1 - b
+                for c in range(start, stop + 1):
+                    if crossings[p, c] == 0:
+                        continue
+                    if collect == 0:
+                        crossed[p, c] += 1.0
+                        continue
+                    n = filled[c]
+                    tau = (c - c0) / (c1 - c0)
+                    scale = 1.0 / (crossed[p, c] * chosen.sum())
+                    keys[c, n], weights[c, n] = i * rows + a, scale * (1.0 - tau) * (1.0 - u)
+                    keys[c, n + 1], weights[c, n + 1] = i * rows + a + 1, scale * (1.0 - tau) * u
+                    keys[c, n + 2], weights[c, n + 2] = (i + 1) * rows + b, scale * tau * (1.0 - v)
+                    keys[c, n + 3], weights[c, n + 3] = (i + 1) * rows + b + 1, scale * tau * v
+                    filled[c] = n + 4
     for c in range(cols):
         n = filled[c]
         order = np.argsort(keys[c, :n])

@@ -15,6 +15,7 @@ quadrature          dx of each sample
 remove_constant     DC and slow drift
 transform           S(σ)
 phase_polynomial, smooth_phase      φ(σ) from the two-sided part
+fringe_centre       the OPD that φ's slope shifts the fringes to
 radiance            B(σ) and its sigma
 line_shape_response B as the instrument's line shape shows it
 rqe                 relative quadratic error
@@ -53,8 +54,8 @@ def apodization(name: str, u: Array) -> Array:
     """Window at u = OPD/L, zero for |u| > 1 (bar rounding); `name` is one of `APODIZATIONS`.
 
     connes (1−u²)²; triangle 1−|u|; happ-genzel 0.54 + 0.46 cos πu; Norton–Beer Σ c_i (1−u²)^i with i = 0, 1, 2, 4 as
-    published [4]_; Blackman–Harris Σ a_i cos iπu; gaussian exp(−(1.9u)²/2·…) falling to 1 % at u = 1. Raises ValueError for
-    another name.
+    published [4]_; Blackman–Harris Σ a_i cos iπu; gaussian exp(−ln 100·u²), 1 % at u = 1. Raises ValueError for another
+    name.
     """
     u = np.asarray(u, float)
     inside = np.abs(u) <= 1.0 + 1e-12
@@ -79,14 +80,15 @@ def apodization(name: str, u: Array) -> Array:
     return np.where(inside, window, 0.0)
 
 
-def mertz_ramp(opd: Array, short_side: float) -> Array:
-    """Weights 0 → 1 over |OPD| ≤ short_side, w(x) + w(−x) = 1, and 1 on the long side [1]_; opd (..., n) [m].
+def mertz_ramp(opd: Array, short_side: float, centre: float = 0.0) -> Array:
+    """Weights 0 → 1 that count the doubly measured part once and the long side fully [1]_; opd (..., n) [m].
 
-    The long side may be the positive or the negative one.
+    w(c + x) + w(c − x) = 1 about the fringes' centre c (see `fringe_centre`), rising over |x| ≤ short_side − |c|, so that the
+    ramp stays within what the short side measured. The long side may be the positive or the negative one.
     """
     opd = np.asarray(opd, float)
     direction = 1.0 if opd.max() >= -opd.min() else -1.0
-    return np.clip(0.5 * (1.0 + direction * opd / short_side), 0.0, 1.0)
+    return np.clip(0.5 * (1.0 + direction * (opd - centre) / (short_side - abs(centre))), 0.0, 1.0)
 
 
 def quadrature(opd: Array) -> Array:
@@ -121,14 +123,36 @@ def transform(interferogram: Array, opd: Array, window: Array, wavenumber: Array
     if opd.ndim == 1:
         angle = 2.0 * np.pi * np.outer(opd, wavenumber)
         return weighted @ np.cos(angle) - 1j * (weighted @ np.sin(angle))
-    flat, x = (
-        weighted.reshape(-1, weighted.shape[-1]),
-        np.broadcast_to(opd, weighted.shape).reshape(-1, weighted.shape[-1]),
-    )
-    out = np.empty((len(flat), wavenumber.size), complex)
-    for i, (row, at) in enumerate(zip(flat, x, strict=True)):
-        out[i] = np.exp(-2j * np.pi * np.outer(wavenumber, at)) @ row
-    return out.reshape(*weighted.shape[:-1], wavenumber.size)
+    flat = weighted.reshape(-1, weighted.shape[-1])
+    x = np.broadcast_to(opd, weighted.shape).reshape(-1, weighted.shape[-1])
+    return _by_series(flat, x, wavenumber).reshape(*weighted.shape[:-1], wavenumber.size)
+
+
+def _by_series(weighted: Array, opd: Array, wavenumber: Array) -> Complex:
+    """Σ_j v_j·exp(−2πiσx_j) for interferograms (m, n) that each have their own OPDs near common ones.
+
+    With x_j = c_j + s + d_j, c the mean over the interferograms, s one shift each and d what is left, the factor
+    exp(−2πiσd) is expanded in powers of d, so that each order is one product with a table that all share. Samples whose d is
+    too large for that are few orders' worth of work at most: beyond 4 rad the sum is taken as it stands.
+    """
+    common = opd.mean(axis=0)
+    shift = (opd - common).mean(axis=1, keepdims=True)
+    left = opd - common - shift
+    largest = 2.0 * np.pi * float(np.abs(wavenumber).max()) * float(np.abs(left).max(initial=0.0))
+    if largest > 4.0:
+        return np.stack([np.exp(-2j * np.pi * np.outer(wavenumber, x)) @ v for v, x in zip(weighted, opd, strict=True)])
+    angle = 2.0 * np.pi * np.outer(common, wavenumber)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    total = np.zeros((len(weighted), wavenumber.size), complex)
+    term, size, order = weighted, 1.0, 0
+    factor = np.ones(wavenumber.size, complex)
+    while size > 1e-9 or order <= largest:
+        total += factor * (term @ cosine - 1j * (term @ sine))
+        order += 1
+        term = term * left
+        factor = factor * (-2j * np.pi * wavenumber / order)
+        size *= largest / order
+    return total * np.exp(-2j * np.pi * shift * wavenumber)
 
 
 def phase_polynomial(spectrum: Complex, wavenumber: Array, order: int, rounds: int = 4) -> Array:
@@ -146,13 +170,22 @@ def phase_polynomial(spectrum: Complex, wavenumber: Array, order: int, rounds: i
     return coefficients
 
 
-def smooth_phase(coefficients: Array, wavenumber: Array) -> Array:
-    """φ [rad] on the wavenumbers that the coefficients were fitted on."""
-    return np.asarray(np.polynomial.polynomial.polyval(_unit(wavenumber), coefficients), float)
+def smooth_phase(coefficients: Array, wavenumber: Array, span: tuple[float, float] | None = None) -> Array:
+    """φ [rad] at wavenumbers; `span`: first and last of those the coefficients were fitted on, if these are others."""
+    return np.asarray(np.polynomial.polynomial.polyval(_unit(wavenumber, span), coefficients), float)
 
 
-def _unit(wavenumber: Array) -> Array:
-    return 2.0 * (wavenumber - wavenumber[0]) / (wavenumber[-1] - wavenumber[0]) - 1.0
+def _unit(wavenumber: Array, span: tuple[float, float] | None = None) -> Array:
+    low, high = span or (wavenumber[0], wavenumber[-1])
+    return 2.0 * (wavenumber - low) / (high - low) - 1.0
+
+
+def fringe_centre(phase: Array, wavenumber: Array) -> float:
+    """OPD [m] x₀ = −φ′/2π about which the fringes are symmetric: the mean slope of φ is a shift of zero path difference.
+
+    The Mertz ramp must rise about it: about any other point w(x₀ + x) + w(x₀ − x) ≠ 1, a scale error in every spectrum.
+    """
+    return float(-np.polyfit(wavenumber, phase, 1)[0] / (2.0 * np.pi))
 
 
 def radiance(

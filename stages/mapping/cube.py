@@ -125,7 +125,7 @@ def run(
     heights(latitude, longitude) [rad] → [m]; phase (k,) [rad] on wavenumber (k,) [m-1], as the line's spectra have it.
     """
     response = np.interp(wavenumber, calibration.wavenumber, calibration.response)
-    window_of = _windower(interferometer)
+    window_of = _windower(interferometer, fourier.fringe_centre(phase, wavenumber))
     centre, dcm = poses.centre, poses.dcm
     for start in range(0, grid.shape[0], settings.strip_cells):
         stop = min(start + settings.strip_cells, grid.shape[0])
@@ -168,13 +168,12 @@ def run(
         yield start, radiance.reshape(stop - start, grid.shape[1], wavenumber.size)
 
 
-def _windower(interferometer: Interferometer) -> Callable[[Array], tuple[Array, Array]]:
+def _windower(interferometer: Interferometer, centre: float) -> Callable[[Array], tuple[Array, Array]]:
     """rows (cell, col) → OPD and window, one for all cells where rows do not matter."""
 
     def window(opd: Array) -> Array:
-        return fourier.mertz_ramp(opd, interferometer.shortest_side) * fourier.apodization(
-            "connes", opd / interferometer.longest_opd
-        )
+        ramp = fourier.mertz_ramp(opd, interferometer.shortest_side, centre)
+        return ramp * fourier.apodization("connes", opd / interferometer.longest_opd)
 
     columns = np.arange(interferometer.cols)
     if interferometer.fringe_tilt == 0.0:

@@ -74,11 +74,12 @@ def run(
     phase = instrument_phase(
         ac[leading][counted[leading]], _of(opd, leading, counted), interferometer, wavenumber, settings.phase_order
     )
-    read_variance, gain = noise_model(ifg, ac, leading, counted, interferometer)
+    read_variance, gain = noise_model(ifg, ac, leading, counted, interferometer, calibration)
     variance = read_variance + gain * np.maximum(ifg.value, 0.0)
 
     phi = fourier.smooth_phase(phase, wavenumber)
-    window = fourier.mertz_ramp(opd, interferometer.shortest_side) * fourier.apodization(
+    centre_opd = fourier.fringe_centre(phi, wavenumber)
+    window = fourier.mertz_ramp(opd, interferometer.shortest_side, centre_opd) * fourier.apodization(
         APODIZATION, opd / interferometer.longest_opd
     )
     value, sigma = fourier.radiance(ac, opd, window, wavenumber, phi, response, variance * ifg.gain)
@@ -143,22 +144,37 @@ def instrument_phase(ac: Array, opd: Array, interferometer: Interferometer, wave
     """Phase coefficients from the two-sided part of interferograms (point, cols): the spectra share one phase and have
     positive amplitudes, so their complex sum has that phase with the least noise."""
     short = interferometer.shortest_side
-    window = fourier.apodization(APODIZATION, opd / short)
-    return fourier.phase_polynomial(fourier.transform(ac, opd, window, wavenumber).sum(axis=0), wavenumber, order)
+    coefficients, centre = np.zeros(order + 1), 0.0
+    # The window must lie about the fringes' centre, which the phase itself tells: twice more is enough.
+    for _ in range(3):
+        window = fourier.apodization(APODIZATION, (opd - centre) / (short - abs(centre)))
+        mean = fourier.transform(ac, opd, window, wavenumber).sum(axis=0)
+        coefficients = fourier.phase_polynomial(mean, wavenumber, order)
+        centre = fourier.fringe_centre(fourier.smooth_phase(coefficients, wavenumber), wavenumber)
+        centre = float(np.clip(centre, -0.5 * short, 0.5 * short))
+    return coefficients
 
 
 def noise_model(
-    ifg: Interferograms, ac: Array, leading: int, counted: NDArray[np.bool_], interferometer: Interferometer
+    ifg: Interferograms,
+    ac: Array,
+    leading: int,
+    counted: NDArray[np.bool_],
+    interferometer: Interferometer,
+    calibration: Calibration,
 ) -> tuple[float, float]:
-    """read² and gain from the out-of-band power of the leading method's points against their mean signal."""
+    """read² and gain from the out-of-band power of the leading method's points against their mean signal.
+
+    Out of band is where the response table ends, not where the declared range does: light goes on between the two.
+    """
     chosen = counted[leading]
     opd = interferometer.opd((interferometer.rows - 1) / 2, np.arange(interferometer.cols))
     variance = detector.noise_out_of_band(
         ac[leading][chosen],
         ifg.gain[leading][chosen],
         opd,
-        interferometer.wavelength_low,
-        interferometer.wavelength_high,
+        float(calibration.wavenumber[0]),
+        float(calibration.wavenumber[-1]),
     )
     return detector.photon_transfer(ifg.value[leading][chosen].mean(axis=-1), variance)
 

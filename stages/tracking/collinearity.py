@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.interpolate import CubicHermiteSpline
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, StageError
 from pipeline.records import CameraPoses, Targets, Tracks, Trajectory
 from tsmftis.camera import Camera, Mounting, camera_pose
 from tsmftis.geodesy import ecef_to_geodetic, geodetic_to_ecef, ned_to_ecef_dcm, radii_of_curvature
@@ -91,7 +91,10 @@ def camera_poses(trajectory: Trajectory, time: Array, mounting: Mounting) -> Cam
     centre, dcm = np.full((time.size, 3), np.nan), np.full((time.size, 3, 3), np.nan)
     if inside.sum() >= 1:
         part = trajectory.between(time[inside].min() - MARGIN_S, time[inside].max() + MARGIN_S)
-        attitude = Attitude.fit(part.time, rpy_to_dcm(*part.rpy.T))
+        try:
+            attitude = Attitude.fit(part.time, rpy_to_dcm(*part.rpy.T))
+        except ValueError as error:
+            raise StageError(f"no track can be laid through these frames: {error}") from error
         north, east = radii_of_curvature(part.latitude)
         rates = (
             part.velocity[:, 0] / (north + part.height),

@@ -41,6 +41,7 @@ def test_real_files_come_back_bit_for_bit(name: str, tmp_path: Path) -> None:
 
 def position_rate(records: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """NED velocity from position differences, each over its `seconds`."""
+
     def mid(values: np.ndarray) -> np.ndarray:
         return 0.5 * (values[1:] + values[:-1])
 
@@ -61,12 +62,12 @@ def test_velocity_of_the_aircraft_is_that_of_its_positions() -> None:
     velocity = velocity_ned(records)
     middle = 0.5 * (velocity[1:] + velocity[:-1])
     even = position_rate(records, np.full(step.size, step.mean()))
-    assert np.abs(even - middle).max() < 0.01                                       # measured 0.0030
+    assert np.abs(even - middle).max() < 0.01  # measured 0.0030
     moved = np.cumsum(position_rate(records, step) * step[:, None], axis=0)
     expected = np.cumsum(middle * step[:, None], axis=0)
     span = records["time"][51:] - records["time"][1:-50]
     over = (moved - expected)[50:] - (moved - expected)[:-50]
-    assert np.abs(over / span[:, None]).max() < 0.01                                # measured 0.0059
+    assert np.abs(over / span[:, None]).max() < 0.01  # measured 0.0059
 
 
 @real_data
@@ -78,7 +79,7 @@ def test_aircraft_flies_where_it_heads_and_its_rates_are_against_the_local_level
     platform = rpy_to_dcm(records["roll"], records["pitch"], records["platform_heading"])
     turned = log_so3(np.swapaxes(platform[:-1], 1, 2) @ platform[1:]) / np.diff(records["time"])[:, None]
     rate = np.stack([records[f"rate_{axis}"] for axis in "xyz"], -1)[1:]
-    assert np.abs((rate - turned).mean(axis=0)).max() < 2e-6                         # Earth rate alone: 5e-5
+    assert np.abs((rate - turned).mean(axis=0)).max() < 2e-6  # Earth rate alone: 5e-5
 
 
 def test_level_flight_at_constant_velocity() -> None:
@@ -95,8 +96,17 @@ def test_level_flight_at_constant_velocity() -> None:
     to_body = np.swapaxes(dcm, 1, 2)
     ones = np.ones((n, 3))
     trajectory = Trajectory(
-        np.arange(n) * 0.01, latitude, np.full(n, 0.2), height, velocity, rpy, ones, ones, ones,
-        np.einsum("nij,nj->ni", to_body, earth + transport), np.einsum("nij,nj->ni", to_body, force),
+        np.arange(n) * 0.01,
+        latitude,
+        np.full(n, 0.2),
+        height,
+        velocity,
+        rpy,
+        ones,
+        ones,
+        ones,
+        np.einsum("nij,nj->ni", to_body, earth + transport),
+        np.einsum("nij,nj->ni", to_body, force),
     )
     records = from_trajectory(trajectory)
     np.testing.assert_allclose(velocity_ned(records), velocity, atol=1e-12)

@@ -20,7 +20,7 @@ from tsmftis import fourier
 SHARED = Path(os.environ.get("TSMFTIS_SHARED", Path(__file__).parents[2].parent / "shared")) / "data" / "opus"
 real_data = pytest.mark.skipif(not SHARED.is_dir(), reason=f"measured OPUS files are not in {SHARED}")
 
-STEP, CENTRE, WIDTH = 0.5e-6, 4e5, 3e4          # m, m-1, m-1
+STEP, CENTRE, WIDTH = 0.5e-6, 4e5, 3e4  # m, m-1, m-1
 DENSITY = BenchSettings(normalisation_per_m=1.0, apodization="boxcar", phase_correction="mertz")
 
 
@@ -75,7 +75,7 @@ def test_one_sided_agrees_with_two_sided(phase: float, tolerance: float) -> None
     assert a.parameters.ramp is None and b.parameters.ramp == pytest.approx(60e-6, rel=0.02)
     assert any("one-sided" in note for note in b.notes)
     assert np.linalg.norm(a.spectrum - b.spectrum) < tolerance * np.linalg.norm(a.spectrum)
-    other = -one[::-1]                                                     # the long side is the negative one
+    other = -one[::-1]  # the long side is the negative one
     mirrored = run(bench(gaussian(other, -phase), other), settings)
     assert np.linalg.norm(a.spectrum - mirrored.spectrum) < tolerance * np.linalg.norm(a.spectrum)
 
@@ -89,7 +89,7 @@ def test_power_of_a_one_sided_scan_is_cut_to_its_short_side() -> None:
 
 def test_each_scan_has_its_own_zpd() -> None:
     x = axis()
-    scans = np.stack([gaussian(x), gaussian(x - 12 * STEP), 14.0 - gaussian(x + 9.3 * STEP)])   # the last one inverted
+    scans = np.stack([gaussian(x), gaussian(x - 12 * STEP), 14.0 - gaussian(x + 9.3 * STEP)])  # the last one inverted
     result = run(bench(scans, x), DENSITY.model_copy(update={"resolution_per_m": 0.9 / 380e-6}))
     assert error(result, gaussian_line(result.wavenumber)) < 2e-3
     np.testing.assert_allclose(result.scans, np.tile(result.scans[0], (3, 1)), atol=2e-3 * result.spectrum.max())
@@ -191,8 +191,10 @@ def test_settings_refuse_what_they_do_not_know() -> None:
 @pytest.mark.parametrize(
     ("name", "channel"),
     [
-        ("brukeropus_file.0", "sample"), ("brukeropus_file.0", "reference"),
-        ("opusreader2_617262_1TP_C-1_A5.0", "sample"), ("opusreader2_617262_1TP_C-1_A5.0", "reference"),
+        ("brukeropus_file.0", "sample"),
+        ("brukeropus_file.0", "reference"),
+        ("opusreader2_617262_1TP_C-1_A5.0", "sample"),
+        ("opusreader2_617262_1TP_C-1_A5.0", "reference"),
     ],
 )
 def test_vendor_spectrum_is_met(name: str, channel: str) -> None:

@@ -119,7 +119,7 @@ def test_panels_lie_in_the_frames_where_the_contract_projects_them(folder: Path)
         # fringes vary along columns: each column is held against its own ground
         patch = frames[k, top : top + 15, left : left + 15]
         light = np.maximum(patch - 1.3 * np.median(frames[k][:, left : left + 15], axis=0), 0.0)
-        light = light / np.maximum(light.sum(axis=0), 1e-9)      # column by column
+        light = light / np.maximum(light.sum(axis=0), 1e-9)  # column by column
         seen = (patch > 2.0 * np.median(frames[k][:, left : left + 15], axis=0)).sum(axis=0) > 6
         rows = (light * (top + np.arange(15))[:, None]).sum(axis=0)[seen]
         errors.append((rows.mean() - row[k], (left + np.flatnonzero(seen)).mean() - col[k]))
@@ -153,7 +153,7 @@ def test_a_tracked_panel_gives_the_radiance_of_its_material(folder: Path) -> Non
         inside = (sigma > 1.25e6) & (sigma < 2.05e6)
         spectrum = (found / np.interp(sigma, grid, response))[inside]
         difference = np.abs(spectrum - np.interp(sigma, grid, radiance)[inside])
-        assert np.median(difference) < 0.05 * radiance.max()       # narrow absorption lines are not resolved
+        assert np.median(difference) < 0.05 * radiance.max()  # narrow absorption lines are not resolved
 
 
 def test_picked_points_project_where_they_were_picked(folder: Path, campaign: SimulatedCampaign) -> None:
@@ -189,34 +189,62 @@ def test_every_file_has_the_contracts_variables_and_units(folder: Path) -> None:
     manifest = yaml.safe_load((folder / "campaign.yaml").read_text())
     assert manifest["format"] == "tsmftis-campaign/1"
     assert set(manifest["flights"][0]["initial"]) == {
-        "time_s", "roll_deg", "pitch_deg", "yaw_deg", "sigma_roll_deg", "sigma_pitch_deg", "sigma_yaw_deg",
+        "time_s",
+        "roll_deg",
+        "pitch_deg",
+        "yaw_deg",
+        "sigma_roll_deg",
+        "sigma_pitch_deg",
+        "sigma_yaw_deg",
     }
     imu, fixes = read(folder / manifest["flights"][0]["imu"]), read(folder / manifest["flights"][0]["gnss"])
     line = read(folder / manifest["flights"][0]["lines"][0]["frames"])
     chamber = read(folder / manifest["thermal"]["train"][0])
     calibration, references = read(folder / manifest["calibration"]), read(folder / manifest["references"])
     for dataset, variables in (
-        (imu, {
-            "time": (("time",), "s"), "gyro": (("time", "axis"), "rad s-1"), "accel": (("time", "axis"), "m s-2"),
-            "time_temperature": (("time_temperature",), "s"),
-            "temperature_gyro": (("time_temperature", "axis", "thermometer"), "degC"),
-            "temperature_accel": (("time_temperature", "axis"), "degC"),
-        }),
-        (fixes, {
-            "time": (("time",), "s"), "latitude": (("time",), "degrees_north"),
-            "longitude": (("time",), "degrees_east"), "height": (("time",), "m"),
-            "velocity": (("time", "ned"), "m s-1"), "sigma_position": (("time", "ned"), "m"),
-            "sigma_velocity": (("time", "ned"), "m s-1"),
-        }),
+        (
+            imu,
+            {
+                "time": (("time",), "s"),
+                "gyro": (("time", "axis"), "rad s-1"),
+                "accel": (("time", "axis"), "m s-2"),
+                "time_temperature": (("time_temperature",), "s"),
+                "temperature_gyro": (("time_temperature", "axis", "thermometer"), "degC"),
+                "temperature_accel": (("time_temperature", "axis"), "degC"),
+            },
+        ),
+        (
+            fixes,
+            {
+                "time": (("time",), "s"),
+                "latitude": (("time",), "degrees_north"),
+                "longitude": (("time",), "degrees_east"),
+                "height": (("time",), "m"),
+                "velocity": (("time", "ned"), "m s-1"),
+                "sigma_position": (("time", "ned"), "m"),
+                "sigma_velocity": (("time", "ned"), "m s-1"),
+            },
+        ),
         (line, {"frames": (("frame", "row", "col"), "DN"), "time": (("frame",), "s")}),
-        (chamber, {
-            "time": (("time",), "s"), "gyro": (("time", "axis"), "rad s-1"), "accel": (("time", "axis"), "m s-2"),
-            "temperature_gyro": (("time", "axis", "thermometer"), "degC"),
-            "temperature_accel": (("time", "axis"), "degC"), "temperature_chamber": (("time",), "degC"),
-        }),
-        (calibration, {
-            "dark": (("row", "col"), "DN"), "flat": (("row", "col"), "1"), "wavenumber": (("wavenumber",), "m-1"),
-        }),
+        (
+            chamber,
+            {
+                "time": (("time",), "s"),
+                "gyro": (("time", "axis"), "rad s-1"),
+                "accel": (("time", "axis"), "m s-2"),
+                "temperature_gyro": (("time", "axis", "thermometer"), "degC"),
+                "temperature_accel": (("time", "axis"), "degC"),
+                "temperature_chamber": (("time",), "degC"),
+            },
+        ),
+        (
+            calibration,
+            {
+                "dark": (("row", "col"), "DN"),
+                "flat": (("row", "col"), "1"),
+                "wavenumber": (("wavenumber",), "m-1"),
+            },
+        ),
         (references, {"radiance": (("reference", "wavenumber"), "reference radiance unit")}),
     ):
         for name, (dims, units) in variables.items():
@@ -307,12 +335,16 @@ def test_without_initial_none_is_written(tmp_path: Path) -> None:
 def test_motion_within_the_exposure_blurs() -> None:
     good = tiny().model_dump()
     sharp = run(tiny(), 3).lines[0].frames.astype(float)
-    blurred = run(
-        SimulationSettings.model_validate(
-            good | {"detector": good["detector"] | {"exposure_s": 0.03, "exposure_instants": 6}}
-        ),
-        3,
-    ).lines[0].frames.astype(float)
+    blurred = (
+        run(
+            SimulationSettings.model_validate(
+                good | {"detector": good["detector"] | {"exposure_s": 0.03, "exposure_instants": 6}}
+            ),
+            3,
+        )
+        .lines[0]
+        .frames.astype(float)
+    )
     assert np.abs(np.diff(blurred, axis=1)).mean() < np.abs(np.diff(sharp, axis=1)).mean()
 
 

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 DEG_PER_H = np.deg2rad(1.0) / 3600.0
 MICRO_G = 9.80665e-6
-GYRO_NOISE, ACCEL_NOISE = 0.006 * DEG_PER_H, 1.2 * MICRO_G      # of 100 s means
+GYRO_NOISE, ACCEL_NOISE = 0.006 * DEG_PER_H, 1.2 * MICRO_G  # of 100 s means
 TRAIN = [(0, 20), (90, 20), (100, 50), (220, 50), (246.7, -30), (366, -30)]
 VERIFY = [(0, 20), (60, 20), (110, -30), (170, -30), (200, 30), (260, 30), (280, -30), (340, -30)]
 
@@ -63,12 +63,17 @@ def chamber(profile: list[tuple[float, float]], seed: int, dt: float = 2.0) -> t
     bias = np.column_stack([g * DEG_PER_H for g in gyro] + [f * MICRO_G for f in accel])
     noise = rng.standard_normal(bias.shape) * np.repeat([GYRO_NOISE, ACCEL_NOISE], 3) * np.sqrt(100.0 / dt)
     stood = Chamber(
-        "own", time, np.zeros((len(time), 3)), np.zeros((len(time), 3)),
+        "own",
+        time,
+        np.zeros((len(time), 3)),
+        np.zeros((len(time), 3)),
         Temperatures(
-            time, np.repeat(thermometers[:, None], 3, axis=1) + 0.02 * rng.standard_normal((len(time), 3, 3)),
+            time,
+            np.repeat(thermometers[:, None], 3, axis=1) + 0.02 * rng.standard_normal((len(time), 3, 3)),
             np.repeat(accel_t[:, None], 3, axis=1) + 0.02 * rng.standard_normal((len(time), 3)),
         ),
-        StaticAttitude(np.deg2rad(40.0), 30.0, 0.01, -0.02, 0.6), None,
+        StaticAttitude(np.deg2rad(40.0), 30.0, 0.01, -0.02, 0.6),
+        None,
     )
     reading = expected_reading(stood) + bias + noise
     return replace(stood, gyro=reading[:, :3], accel=reading[:, 3:]), bias
@@ -179,8 +184,11 @@ def test_network_with_a_centre_at_every_datum_is_a_gaussian_process() -> None:
 
 def test_an_ideal_imu_has_no_bias() -> None:
     own, _ = chamber(TRAIN[:2], 1)
-    ideal = replace(own, gyro=np.tile(expected_reading(own)[:3], (len(own.time), 1)),
-                    accel=np.tile(expected_reading(own)[3:], (len(own.time), 1)))
+    ideal = replace(
+        own,
+        gyro=np.tile(expected_reading(own)[:3], (len(own.time), 1)),
+        accel=np.tile(expected_reading(own)[3:], (len(own.time), 1)),
+    )
     assert np.abs(bias_samples(ideal)).max() < 1e-15
     level = replace(own, attitude=StaticAttitude(np.deg2rad(40.0), 0.0, 0.0, 0.0, 0.0))
     np.testing.assert_allclose(expected_reading(level)[3:], [0.0, 0.0, -9.80169], atol=1e-4)
@@ -398,9 +406,12 @@ def test_shared_campaign_clean_reaches_its_floor() -> None:
     with np.load(truth) as z:
         noise = np.hstack([verify.gyro - z["verify_gyro"], verify.accel - z["verify_accel"]])
     floor = noise[: len(noise) // 100 * 100].reshape(-1, 100, 6).mean(axis=1).std(axis=0)
-    left = np.r_[
-        np.array(result.verification["gyro_std_deg_per_h"]["bayesian_rbf"]) * DEG_PER_H,
-        np.array(result.verification["accel_std_ug"]["bayesian_rbf"]) * MICRO_G,
-    ] / floor
+    left = (
+        np.r_[
+            np.array(result.verification["gyro_std_deg_per_h"]["bayesian_rbf"]) * DEG_PER_H,
+            np.array(result.verification["accel_std_ug"]["bayesian_rbf"]) * MICRO_G,
+        ]
+        / floor
+    )
     assert np.median(left[:3]) <= 1.15 and np.median(left[3:]) <= 1.15
     assert left.max() <= 1.35

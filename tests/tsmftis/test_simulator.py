@@ -74,7 +74,7 @@ def test_rates_integrated_in_the_inertial_frame_give_the_attitude(aircraft: flig
     for turn in Rotation.from_rotvec(gyro * step):
         attitude = attitude * turn
     wrong = attitude.inv() * Rotation.from_matrix(to_inertial(end[-1]) @ stop)
-    assert wrong.magnitude() < 1e-9 * 4000 ** 0.5
+    assert wrong.magnitude() < 1e-9 * 4000**0.5
 
 
 def test_force_and_gravitation_integrated_give_the_inertial_velocity(aircraft: flight.Flight) -> None:
@@ -136,7 +136,7 @@ def test_derivatives_of_the_flight_are_exact(aircraft: flight.Flight) -> None:
     np.testing.assert_allclose(aircraft.velocity(t), speed, atol=1e-5)
     change = (aircraft.velocity(t + h) - aircraft.velocity(t - h)) / (2.0 * h)
     np.testing.assert_allclose(aircraft.acceleration(t), change, atol=1e-5)
-    h = 2e-5                              # short against the vibration's 20 ms
+    h = 2e-5  # short against the vibration's 20 ms
     turn = Rotation.from_matrix(np.swapaxes(aircraft.attitude(t - h), 1, 2) @ aircraft.attitude(t + h)).as_rotvec()
     np.testing.assert_allclose(aircraft.angular_rate(t), turn / (2.0 * h), atol=1e-5)
 
@@ -160,7 +160,7 @@ def test_the_plan_is_flown_and_turns_are_coordinated() -> None:
     np.testing.assert_allclose(geodetic[1, 2] - geodetic[0, 2], 30.0, atol=1e-3)
     assert abs(attitude[2, 0] - 0.35) < 0.02
     _, force = inertial.sensed(aircraft, np.array([path.duration / 2.0]))
-    assert abs(force[0, 1]) < 0.05        # no side force but Coriolis'
+    assert abs(force[0, 1]) < 0.05  # no side force but Coriolis'
 
 
 def test_harmonics_have_the_spread_asked_for_and_repeat_with_the_seed() -> None:
@@ -413,7 +413,7 @@ def test_a_panel_is_seen_where_the_contract_projects_it() -> None:
 def test_bare_ground_gives_its_own_signal_and_instants_average() -> None:
     scene = _scene()
     signal = np.random.default_rng(0).uniform(1.0, 2.0, (2, 16, 20))
-    far = lens.Lens(600.0, 10.0, 4000.0, 0.0)       # looks past the panel
+    far = lens.Lens(600.0, 10.0, 4000.0, 0.0)  # looks past the panel
     position, to_ecef = _pose()
     frame = imaging.expose(position, to_ecef, far, scene, signal, 2)
     np.testing.assert_allclose(frame[0], signal[0], rtol=1e-6)

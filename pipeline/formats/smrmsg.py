@@ -1,0 +1,76 @@
+"""SMRMSG: the error estimates that go with an SBET, 10 little-endian float64 a record, no header.
+
+Fields: time [s], RMS of position north, east, down [m], of velocity north, east, down [m/s], and of roll, pitch, heading
+[arc minutes].
+
+Functions
+---------
+read_smrmsg, write_smrmsg       bit for bit
+from_trajectory                 a trajectory's sigmas as records
+
+References
+----------
+.. [1] Applanix, POSPac MMS: SMRMSG format.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.records import Trajectory
+
+FIELDS = (
+    "time",
+    *(f"{quantity}_{axis}" for quantity in ("position", "velocity") for axis in ("north", "east", "down")),
+    "roll", "pitch", "heading",
+)  # fmt: skip
+DTYPE = np.dtype([(name, "<f8") for name in FIELDS])
+ARC_MINUTES = 60.0 * 180.0 / np.pi  # of one radian
+
+
+def read_smrmsg(path: Path) -> NDArray[Any]:
+    """Records (n,) of an SMRMSG file; raises InputError where it cannot be one."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            path, "file", f"cannot be read ({error.strerror})", "correct the name or its permissions"
+        ) from error
+    if not content or len(content) % DTYPE.itemsize:
+        raise InputError(
+            path,
+            "file",
+            f"has {len(content)} bytes",
+            f"an SMRMSG has {DTYPE.itemsize} bytes a record: it is truncated or none",
+        )
+    records = np.frombuffer(content, DTYPE).copy()
+    for name in FIELDS:
+        bad = ~np.isfinite(records[name]) | ((records[name] < 0) if name != "time" else False)
+        if bad.any():
+            i = int(np.argmax(bad))
+            raise InputError(
+                path, f"record {i}, {name}", f"is {records[name][i]:g}", "the file is no SMRMSG, or damaged there"
+            )
+    return records
+
+
+def write_smrmsg(records: NDArray[Any], path: Path) -> None:
+    """Write records of `DTYPE`; what `read_smrmsg` gave comes out bit for bit."""
+    if records.dtype != DTYPE or records.ndim != 1:
+        raise ValueError(f"records must be (n,) of the SMRMSG dtype, not {records.shape} of {records.dtype}")
+    path.write_bytes(records.tobytes())
+
+
+def from_trajectory(trajectory: Trajectory) -> NDArray[Any]:
+    """A trajectory's sigmas (n samples) as records (n,)."""
+    t = trajectory
+    records = np.empty(t.time.size, DTYPE)
+    columns = (t.time, *t.sigma_position.T, *t.sigma_velocity.T, *(t.sigma_attitude.T * ARC_MINUTES))
+    for name, column in zip(FIELDS, columns, strict=True):
+        records[name] = column
+    return records
