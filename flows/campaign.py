@@ -32,16 +32,16 @@ Future = PrefectFuture[StageRecord]
 
 
 @task(name="stage", task_run_name="{stage} {unit}", cache_policy=NO_CACHE, persist_result=False)
-def run_step(plan: Plan, stage: str, unit: str) -> StageRecord:
-    """One stage of one unit. A stage that fails says so in its record, so that the other lines go on."""
+def run_step(plan: Plan, stage: str, unit: str, before: list[StageRecord]) -> StageRecord:
+    """One stage of one unit, after those `before` it. A stage that fails says so in its record, and stops its chain alone."""
+    if any(record.status != "done" for record in before):
+        return StageRecord(stage, unit, "skipped", False, 0.0, "", {})
     step = getattr(steps, f"{stage}_step")
     arguments = () if stage == "thermal" else tuple(unit.split("/"))
     try:
         record: StageRecord = step(plan, *arguments)
-    except InputError:
-        raise
     except TsmftisError as error:
-        return StageRecord(stage, unit, "failed", False, 0.0, "", {}, str(error))
+        return StageRecord(stage, unit, "failed", False, 0.0, "", {}, error)
     return record
 
 
@@ -55,7 +55,8 @@ class _Graph:
     def submit(self, stage: str, unit: str, after: list[Future]) -> list[Future]:
         if not self.plan.does(stage):
             return after
-        future = run_step.submit(plan=self.plan, stage=stage, unit=unit, wait_for=after, return_state=False)
+        # Futures among the arguments are waited for and handed over as what they came to.
+        future = run_step.submit(plan=self.plan, stage=stage, unit=unit, before=after, return_state=False)
         self.futures.append(future)
         return [future]
 
@@ -70,16 +71,15 @@ class _Graph:
                 self.line(flight, line.id, after)
 
     def results(self, listener: Listener | None) -> list[StageRecord]:
-        """Records in the order of submission. A wrong input is raised after all tasks that do not hang on it have ended."""
+        """Records in the order of submission, failed and skipped ones among them; `listener` hears of each as it ends."""
         for future in as_completed(self.futures):
-            ended = future.result(raise_on_failure=False)
-            if listener and isinstance(ended, StageRecord):
-                listener(ended)
-        # Not all at once above: a task that never ran because one before it failed would raise in that one's place.
-        outcomes: list[Any] = [future.result(raise_on_failure=False) for future in self.futures]
-        for outcome in outcomes:
-            if isinstance(outcome, TsmftisError):
-                raise outcome
+            future.wait()
+            if listener and future.state.is_completed():
+                listener(future.result())
+        # Only a bug in a stage leaves a task that did not complete: its exception is raised, not that of one waiting for it.
+        for future in self.futures:
+            if future.state.is_failed() or future.state.is_crashed():
+                future.result()
         return [future.result() for future in self.futures]
 
 

@@ -27,11 +27,11 @@ def assemble(plan: Plan, records: list[StageRecord]) -> dict[str, Any]:
         for unit in units[stage]:
             if record := known.get((stage, unit)):
                 entry = {"status": record.status, "seconds": record.seconds, "digest": record.digest}
-                stages.setdefault(stage, {})[unit] = entry | ({"error": record.error} if record.error else {})
+                stages.setdefault(stage, {})[unit] = entry | ({"error": str(record.problem)} if record.problem else {})
 
     def summary(stage: str, unit: str) -> dict[str, Any] | None:
         record = known.get((stage, unit))
-        return None if record is None or record.status == "failed" else record.summary
+        return record.summary if record is not None and record.status == "done" else None
 
     flights: dict[str, Any] = {}
     partly: dict[str, list[str]] = {}
@@ -65,7 +65,7 @@ def assemble(plan: Plan, records: list[StageRecord]) -> dict[str, Any]:
         "stages": stages,
         "provenance": _provenance(plan),
     }
-    if (verification := summary("thermal", "campaign")) is not None:
+    if keys.thermal and (verification := summary("thermal", "campaign")) is not None:
         content["thermal"] = verification
     return content
 

@@ -43,7 +43,7 @@ def load_settings(file: Path | None, assignments: list[str]) -> Settings:
             raise InputError(
                 file, "file", f"cannot be read ({error.strerror})", "give an existing settings file"
             ) from error
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
             raise InputError(file, "file", "is not valid YAML", "correct the syntax") from error
         if not isinstance(content, dict):
             raise InputError(file, "file", "holds no keys", "write stage: {key: value}")
@@ -62,4 +62,4 @@ def load_settings(file: Path | None, assignments: list[str]) -> Settings:
             part[key.strip()] = yaml.safe_load(value)
         except yaml.YAMLError as error:
             raise InputError("--set", f"'{assignment}'", "has a value that is not valid YAML", "quote it") from error
-    return validate(Settings, content, where)
+    return validate(Settings, content, where, "`tsmftis settings` prints all")

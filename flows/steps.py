@@ -13,7 +13,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from rasterio.transform import Affine
 from rasterio.windows import Window
@@ -23,7 +22,7 @@ from pipeline.campaign import Campaign, read_campaign
 from pipeline.datasets import write_dataset
 from pipeline.errors import InputError
 from pipeline.formats import sbet
-from pipeline.raster import Dem, open_cube
+from pipeline.raster import Dem, Quicklook, open_cube
 from pipeline.records import CameraPoses, Imu, Spectra, ThermalCorrection, Tracks, Trajectory
 from pipeline.run_stage import StageRecord, run_stage, write_json
 from stages import bench as bench_stage
@@ -95,7 +94,7 @@ def thermal_step(plan: Plan) -> StageRecord:
         plan.out,
         "thermal",
         "campaign",
-        "stages.thermal",
+        ("stages.thermal",),
         {"settings": _plain(plan.settings.thermal), "train": list(keys.train), "verify": list(keys.verify)},
         {n: campaign.path(n) for n in names},
         {"model": "thermal_model.nc", "figures": "thermal_figures.json"},
@@ -143,7 +142,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         plan.out,
         "navigation",
         flight,
-        "stages.navigation",
+        ("stages.navigation", "pipeline.formats.sbet"),
         {
             "settings": _plain(plan.settings.navigation),
             "imu": _plain(instrument.imu),
@@ -187,7 +186,7 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
         plan.out,
         "tracking",
         f"{flight}/{line}",
-        "stages.tracking",
+        ("stages.tracking",),
         {
             "settings": _plain(plan.settings.tracking),
             "camera": _plain(instrument.camera),
@@ -227,7 +226,7 @@ def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
         plan.out,
         "registration",
         f"{flight}/{line}",
-        "stages.registration",
+        ("stages.registration",),
         {"settings": _plain(plan.settings.registration)},
         {"tracks": _needed(source, "tracking"), "frames": campaign.path(campaign.line(flight, line).frames)},
         {"tracks": f"{flight}/{line}/tracks.nc"},
@@ -270,7 +269,7 @@ def reconstruction_step(plan: Plan, flight: str, line: str) -> StageRecord:
         plan.out,
         "reconstruction",
         f"{flight}/{line}",
-        "stages.reconstruction",
+        ("stages.reconstruction",),
         {
             "settings": _plain(plan.settings.reconstruction),
             "camera": _plain(instrument.camera),
@@ -314,7 +313,7 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
         )
         wavenumber = interferometer.scored_wavenumbers(settings.wavenumber_step_per_m)
         phase = smooth_phase(coefficients, wavenumber, (scored[0], scored[-1]))
-        quicklook = _Quicklook(grid.shape, wavenumber)
+        quicklook = Quicklook(grid.shape, wavenumber)
         with open_cube(to["cube"], grid.crs, Affine(*grid.affine), grid.shape, 1e9 / wavenumber) as cube:
             for start, strip in mapping.run(
                 campaign.frames(flight, line),
@@ -344,7 +343,7 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
         plan.out,
         "mapping",
         f"{flight}/{line}",
-        "stages.mapping",
+        ("stages.mapping", "pipeline.raster"),
         {
             "settings": _plain(settings),
             "camera": _plain(instrument.camera),
@@ -355,33 +354,6 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
         work,
         **plan.switches("mapping"),
     )
-
-
-class _Quicklook:
-    """An RGB picture of the cube, gathered strip by strip: 640, 550, 460 nm or what the range has nearest to them."""
-
-    def __init__(self, shape: tuple[int, int], wavenumber: np.ndarray) -> None:
-        wavelength = 1e9 / wavenumber
-        spread = np.clip([460.0, 550.0, 640.0], wavelength.min(), wavelength.max())
-        self.bands = [int(np.argmin(np.abs(wavelength - w))) for w in spread]
-        self.image = np.full((*shape, 3), np.nan, np.float32)
-
-    def add(self, start: int, strip: np.ndarray) -> None:
-        self.image[start : start + strip.shape[0]] = strip[:, :, self.bands]
-
-    @property
-    def seen_fraction(self) -> float:
-        return float(np.isfinite(self.image[..., 0]).mean())
-
-    def write(self, path: Path) -> None:
-        """8 bit, each colour stretched to its 1st to 99th percentile; unseen cells are transparent. Flown upwards."""
-        seen = np.isfinite(self.image).all(axis=2)
-        scaled = np.zeros_like(self.image)
-        if seen.any():
-            low, high = np.percentile(self.image[seen], [1, 99], axis=0)
-            scaled[seen] = np.clip((self.image[seen] - low) / np.maximum(high - low, 1e-12), 0.0, 1.0)
-        picture = np.dstack([(255 * np.sqrt(scaled)).astype(np.uint8), (255 * seen).astype(np.uint8)])
-        cv2.imwrite(str(path), picture[::-1])
 
 
 def scoring_step(plan: Plan, flight: str, line: str) -> StageRecord:
@@ -398,7 +370,7 @@ def scoring_step(plan: Plan, flight: str, line: str) -> StageRecord:
         plan.out,
         "scoring",
         f"{flight}/{line}",
-        "stages.scoring",
+        ("stages.scoring",),
         {},
         {"spectra": _needed(spectra, "reconstruction")},
         {"scores": f"{flight}/{line}/scores.json"},
@@ -426,7 +398,7 @@ def bench_step(plan: Plan, bench: str) -> StageRecord:
         plan.out,
         "bench",
         bench,
-        "stages.bench",
+        ("stages.bench",),
         {"settings": _plain(plan.settings.bench)},
         {"interferogram": campaign.path(entry.file)},
         {"spectrum": f"bench/{bench}.nc"},

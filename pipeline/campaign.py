@@ -7,12 +7,13 @@ asked for (`Campaign.imu`, `.frames`, …), so a run over trajectory only never 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError, field_validator
 
 from pipeline import records
 from pipeline.errors import InputError
@@ -20,7 +21,10 @@ from tsmftis.camera import Camera, Mounting
 from tsmftis.inertial import DEG_PER_H, MICRO_G, ImuModel, SensorModel
 from tsmftis.interferometer import Interferometer
 
-FORMAT = "tsmftis-campaign/1"
+ZARR_MARKERS = ("zarr.json", ".zgroup", ".zmetadata")
+# A flight's folder stands beside these in the results, a line's beside those.
+TAKEN_BY_RESULTS = {"bench", "run.json", "report.html", "thermal_model.nc", "thermal_figures.json", ".stages"}
+TAKEN_BY_FLIGHT = {"trajectory.nc", "trajectory.sbet", "navigation.json", "thermal.nc"}
 
 Identifier = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]+$")]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -37,6 +41,12 @@ class Strict(BaseModel):
 class TimeKeys(Strict):
     scale: Literal["GPS"]
     epoch: str
+
+    @field_validator("epoch")
+    @classmethod
+    def _is_a_date(cls, value: str) -> str:
+        datetime.fromisoformat(value)
+        return value
 
 
 class InitialKeys(Strict):
@@ -113,6 +123,14 @@ class AngleKeys(Strict):
     yaw: Finite = 0.0
 
 
+class BoresightKeys(Strict):
+    """No angle has a default here: a boresight that was never calibrated is no boresight of zero."""
+
+    roll: Finite
+    pitch: Finite
+    yaw: Finite
+
+
 Vector = Annotated[tuple[Finite, Finite, Finite], Field()]
 
 
@@ -120,7 +138,7 @@ class MountingKeys(Strict):
     imu_to_body_deg: AngleKeys = AngleKeys()
     imu_to_antenna_m: Vector | None = None
     imu_to_camera_m: Vector | None = None
-    boresight_deg: AngleKeys | None = None
+    boresight_deg: BoresightKeys | None = None
 
 
 class PrincipalPointKeys(Strict):
@@ -131,8 +149,8 @@ class PrincipalPointKeys(Strict):
 class CameraKeys(Strict):
     rows: int = Field(gt=1)
     cols: int = Field(gt=7)
-    pixel_pitch_m: Positive
-    focal_length_m: Positive
+    pixel_pitch_m: Annotated[float, Field(gt=0, lt=1e-3)]
+    focal_length_m: Annotated[float, Field(gt=0, lt=10)]
     principal_point_px: PrincipalPointKeys
     frame_rate_hz: Positive
     saturation_dn: Positive
@@ -258,6 +276,9 @@ def read_campaign(folder: Path) -> Campaign:
     for place, name in _named_files(keys):
         _confined(root, name, where, place)
     _unique([f.id for f in keys.flights], where, "flights[].id")
+    _free([f.id for f in keys.flights], TAKEN_BY_RESULTS, where, "flights[].id")
+    _free([entry.id for f in keys.flights for entry in f.lines], TAKEN_BY_FLIGHT, where, "flights[].lines[].id")
+    _free([b.id for b in keys.bench], set(), where, "bench[].id")
     _unique([b.id for b in keys.bench], where, "bench[].id")
     for flight in keys.flights:
         _unique([entry.id for entry in flight.lines], where, f"flights[{flight.id}].lines[].id")
@@ -284,27 +305,24 @@ def _validated(model: type[Any], path: Path) -> Any:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}" if mark else "file"
         raise InputError(path, place, "is not valid YAML", "correct the syntax") from error
-    if not isinstance(content, dict):
-        raise InputError(path, "file", "holds no keys", "see the campaign format")
     return validate(model, content, path)
 
 
-def validate(model: type[Any], content: Any, where: Path | str) -> Any:
+def validate(model: type[Any], content: Any, where: Path | str, hint: str = "see the campaign format") -> Any:
     """`model` from plain data; the first thing wrong becomes an InputError that names the key."""
+    if not isinstance(content, dict):
+        raise InputError(where, "file", "holds no keys", hint)
     try:
         return model.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(p) for p in first["loc"]) or "file"
+        place = f"key '{'.'.join(map(str, first['loc']))}'" if first["loc"] else "file"
         if first["type"] == "extra_forbidden":
-            raise InputError(
-                where, f"key '{place}'", "is not known", "remove it or correct its spelling (see the campaign format)"
-            ) from None
+            raise InputError(where, place, "is not known", f"remove it or correct its spelling ({hint})") from None
         if first["type"] == "missing":
-            raise InputError(where, f"key '{place}'", "is missing", "add it (see the campaign format)") from None
-        raise InputError(
-            where, f"key '{place}'", f"{first['msg']} (given: {str(first['input'])[:60]!r})", "correct the value"
-        ) from None
+            raise InputError(where, place, "is missing", f"add it ({hint})") from None
+        said = first["msg"].replace("a valid tuple", "a list").removeprefix("Value error, ")
+        raise InputError(where, place, f"{said} (given: {str(first['input'])[:60]!r})", "correct the value") from None
 
 
 def _named_files(keys: CampaignKeys) -> list[tuple[str, str]]:
@@ -323,8 +341,10 @@ def _named_files(keys: CampaignKeys) -> list[tuple[str, str]]:
 
 
 def _confined(root: Path, name: str, where: Path, place: str) -> None:
+    if not name or "\0" in name:
+        raise InputError(where, f"key '{place}'", "is no file name", "name a file by a path relative to the folder")
     path = (root / name).resolve()
-    if not name or Path(name).is_absolute() or not path.is_relative_to(root):
+    if Path(name).is_absolute() or not path.is_relative_to(root):
         raise InputError(
             where,
             f"key '{place}'",
@@ -335,6 +355,20 @@ def _confined(root: Path, name: str, where: Path, place: str) -> None:
         raise InputError(
             where, f"key '{place}'", f"the file '{name}' does not exist", "put it there or correct the name"
         )
+    if path.is_dir() and not any((path / marker).exists() for marker in ZARR_MARKERS):
+        raise InputError(where, f"key '{place}'", f"'{name}' is a folder", "name the file (or Zarr store) inside it")
+
+
+def _free(ids: list[str], taken: set[str], where: Path, place: str) -> None:
+    """Ids become folders of the results: none may be one of the results' own names, or walk out of them."""
+    for name in ids:
+        if name in taken | {".", ".."}:
+            raise InputError(
+                where,
+                f"key '{place}'",
+                f"'{name}' cannot be an id",
+                "it would take the place of one of the results' own names: use another",
+            )
 
 
 def _unique(ids: list[str], where: Path, place: str) -> None:
@@ -367,7 +401,7 @@ def _instrument(
             warnings.append(
                 f"{path.name}: mounting.imu_to_antenna_m is exactly zero: used as it stands; is it surveyed?"
             )
-        boresight = keys.mounting.boresight_deg or AngleKeys()
+        boresight = keys.mounting.boresight_deg or BoresightKeys(roll=0.0, pitch=0.0, yaw=0.0)
         mounting = Mounting(
             np.array(keys.mounting.imu_to_antenna_m),
             np.array(keys.mounting.imu_to_camera_m or (0.0, 0.0, 0.0)),
@@ -429,7 +463,7 @@ def _interferometer(keys: InterferometerKeys, camera: Camera, path: Path) -> Int
     )
 
 
-def _radians(angles: AngleKeys) -> np.ndarray:
+def _radians(angles: AngleKeys | BoresightKeys) -> np.ndarray:
     return np.deg2rad([angles.roll, angles.pitch, angles.yaw])
 
 

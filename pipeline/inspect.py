@@ -12,11 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.campaign import Campaign
+from pipeline.campaign import Campaign, FlightKeys
 from pipeline.errors import InputError
 from pipeline.raster import Dem
 from pipeline.records import GNSS_QUALITIES, Chamber, Gnss, Imu
+from tsmftis.geodesy import SEMI_MAJOR_AXIS
 
+TURN_S = 2.0  # over which courses and turns are compared
+TURN_SPEED = 10.0  # m/s: below it a vehicle may turn without its course, or its course without it
+LEAST_TURN = 1.0  # rad of course change in all, for the comparison to mean anything
 FARTHEST_TARGET_DEG = 1.0  # from the nearest fix: farther is a mistake in the coordinates
 
 
@@ -82,7 +86,7 @@ def inspect_campaign(campaign: Campaign) -> Inspection:
         if gnss is not None:
             _describe_gnss(f"flight {flight.id}: GNSS", gnss, found)
         if imu is not None and gnss is not None:
-            found.attempt(_clocks, campaign, flight.imu, imu, gnss)
+            found.attempt(_fit_together, campaign, flight, imu, gnss)
         for line in flight.lines:
             _describe_line(campaign, flight.id, line.id, imu, gnss, found)
     for bench in keys.bench:
@@ -126,11 +130,12 @@ def _describe_shared(campaign: Campaign, found: Inspection) -> None:
                 flat=f"{calibration.flat.min():.2f} to {calibration.flat.max():.2f}",
                 response=f"{calibration.wavenumber[0] / 100:.0f} to {calibration.wavenumber[-1] / 100:.0f} cm-1",
             )
-            found.attempt(_response_covers, campaign, calibration.wavenumber)
+            found.attempt(_covers, campaign, keys.calibration, "response", calibration.wavenumber)
     if keys.references is not None:
         references = found.attempt(campaign.references)
         if references is not None:
             found.add("references", spectra=", ".join(references.names))
+            found.attempt(_covers, campaign, keys.references, "radiance", references.wavenumber)
     elif any(f.lines for f in keys.flights):
         found.warnings.append("no references: spectra are made but not scored")
     if keys.dem is not None:
@@ -143,15 +148,15 @@ def _describe_shared(campaign: Campaign, found: Inspection) -> None:
             )
 
 
-def _response_covers(campaign: Campaign, wavenumber: np.ndarray) -> None:
+def _covers(campaign: Campaign, name: str, variable: str, wavenumber: np.ndarray) -> None:
     interferometer = campaign.instrument.interferometer
     if interferometer is None:
         return
     low, high = 1.0 / interferometer.wavelength_high, 1.0 / interferometer.wavelength_low
     if wavenumber[0] > low or wavenumber[-1] < high:
         raise InputError(
-            campaign.path(campaign.keys.calibration or ""),
-            "variable 'response'",
+            campaign.path(name),
+            f"variable '{variable}'",
             f"covers {wavenumber[0]:.6g} to {wavenumber[-1]:.6g} m-1 but the instrument's range is {low:.6g} to {high:.6g} m-1",
             "extend the table or correct interferometer.wavelength_range_nm",
         )
@@ -207,7 +212,9 @@ def _describe_gnss(part: str, gnss: Gnss, found: Inspection) -> None:
     )
 
 
-def _clocks(campaign: Campaign, name: str, imu: Imu, gnss: Gnss) -> None:
+def _fit_together(campaign: Campaign, flight: FlightKeys, imu: Imu, gnss: Gnss) -> None:
+    """IMU, fixes and `initial` share one clock, the rates are the nominal ones, and both sensors see the same turns."""
+    name = flight.imu
     inside = (gnss.time >= imu.time[0]) & (gnss.time <= imu.time[-1])
     if inside.sum() < 5:
         raise InputError(
@@ -216,6 +223,52 @@ def _clocks(campaign: Campaign, name: str, imu: Imu, gnss: Gnss) -> None:
             f"spans {imu.time[0]:.1f} to {imu.time[-1]:.1f} s but the fixes {gnss.time[0]:.1f} to {gnss.time[-1]:.1f} s: "
             f"{int(inside.sum())} fixes overlap",
             "both must be seconds on the campaign's one clock",
+        )
+    assert campaign.instrument.imu is not None
+    nominal, rate = campaign.instrument.imu.rate, 1.0 / float(np.median(np.diff(imu.time)))
+    if not 0.2 < rate / nominal < 5.0:
+        raise InputError(
+            campaign.path(name),
+            "variable 'time'",
+            f"runs at {rate:.4g} Hz where instrument.yaml says imu.rate_hz {nominal:g}",
+            "correct the time axis (is it in seconds?) or the nominal rate",
+        )
+    if flight.initial is not None and not imu.time[0] - 1.0 <= flight.initial.time_s < imu.time[-1]:
+        raise InputError(
+            campaign.root / "campaign.yaml",
+            f"key 'flights[{flight.id}].initial.time_s'",
+            f"{flight.initial.time_s:g} s lies outside the IMU's {imu.time[0]:.2f} to {imu.time[-1]:.2f} s",
+            "give a time inside the flight, or leave `initial` out",
+        )
+    _same_turns(campaign, name, imu, gnss)
+
+
+def _same_turns(campaign: Campaign, name: str, imu: Imu, gnss: Gnss) -> None:
+    """In a vehicle's turns the rate about body z is about the rate of the GNSS course; deg/s or swapped axes are not."""
+    assert campaign.instrument.mounting is not None
+    time = np.arange(max(imu.time[0], gnss.time[0]), min(imu.time[-1], gnss.time[-1]), TURN_S)
+    if time.size < 10:
+        return
+    north = np.interp(time, gnss.time, gnss.latitude)
+    east = np.interp(time, gnss.time, np.unwrap(gnss.longitude)) * np.cos(north[0])
+    dn, de = np.diff(north) * SEMI_MAJOR_AXIS, np.diff(east) * SEMI_MAJOR_AXIS
+    fast = np.hypot(dn, de) / TURN_S > TURN_SPEED
+    course = np.diff(np.unwrap(np.arctan2(de, dn))) / TURN_S
+    down = campaign.instrument.mounting.dcm_imu_to_body[2] @ imu.gyro.T
+    turned = np.concatenate([[0.0], np.cumsum(down[1:] * np.diff(imu.time))])
+    # The course of an interval holds at its middle, so its change runs from middle to middle.
+    middle = 0.5 * (time[1:] + time[:-1])
+    rate = np.diff(np.interp(middle, imu.time, turned)) / TURN_S
+    good = fast[1:] & fast[:-1]
+    if good.sum() < 10 or np.abs(course[good]).sum() * TURN_S < LEAST_TURN:
+        return
+    slope = float((course[good] * rate[good]).sum() / max((rate[good] ** 2).sum(), 1e-30))
+    if not 0.2 < slope < 5.0:
+        raise InputError(
+            campaign.path(name),
+            "variable 'gyro'",
+            f"the GNSS course turns at {slope:.3g} times the rate about body z (down), where about 1 is expected",
+            "the rates are in deg s-1, or axes are swapped or turned: correct them or mounting.imu_to_body_deg",
         )
 
 
@@ -272,3 +325,12 @@ def _describe_line(
     gcps = found.attempt(campaign.gcps, flight, line)
     if gcps is not None:
         found.add(part, ground_control=f"{gcps.frame.size} points")
+        if frames is not None and gcps.frame.max(initial=0) >= frames.time.size:
+            found.problems.append(
+                InputError(
+                    campaign.path(keys.gcps or ""),
+                    "column frame",
+                    f"goes up to {gcps.frame.max()} but the line has {frames.time.size} frames",
+                    "count frames from 0",
+                )
+            )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
@@ -116,3 +117,30 @@ def open_cube(
         target.set_band_description(band, f"{wavelength:.3f} nm")
     target.update_tags(wavelength_units="nm", quantity="spectral radiance, reference radiance unit")
     return target
+
+
+class Quicklook:
+    """An RGB picture of the cube, gathered strip by strip: 640, 550, 460 nm or what the range has nearest to them."""
+
+    def __init__(self, shape: tuple[int, int], wavenumber: Array) -> None:
+        wavelength = 1e9 / wavenumber
+        spread = np.clip([460.0, 550.0, 640.0], wavelength.min(), wavelength.max())
+        self.bands = [int(np.argmin(np.abs(wavelength - w))) for w in spread]
+        self.image = np.full((*shape, 3), np.nan, np.float32)
+
+    def add(self, start: int, strip: NDArray[np.float32]) -> None:
+        self.image[start : start + strip.shape[0]] = strip[:, :, self.bands]
+
+    @property
+    def seen_fraction(self) -> float:
+        return float(np.isfinite(self.image[..., 0]).mean())
+
+    def write(self, path: Path) -> None:
+        """8 bit, each colour stretched to its 1st to 99th percentile; unseen cells are transparent. Flown upwards."""
+        seen = np.isfinite(self.image).all(axis=2)
+        scaled = np.zeros_like(self.image)
+        if seen.any():
+            low, high = np.percentile(self.image[seen], [1, 99], axis=0)
+            scaled[seen] = np.clip((self.image[seen] - low) / np.maximum(high - low, 1e-12), 0.0, 1.0)
+        picture = np.dstack([(255 * np.sqrt(scaled)).astype(np.uint8), (255 * seen).astype(np.uint8)])
+        cv2.imwrite(str(path), picture[::-1])

@@ -131,13 +131,23 @@ class Chamber:
                 raise InputError(path, "attributes", f"{missing} missing", f"give all of {', '.join(keys)} or none")
             attitude = None
             if given:
-                value = {k: float(dataset.attrs[k]) for k in keys}
+                value = {k: _attribute(dataset, path, k) for k in keys}
                 attitude = StaticAttitude(
                     np.deg2rad(value["latitude_deg"]),
                     value["height_m"],
                     *(float(np.deg2rad(value[k])) for k in ("roll_deg", "pitch_deg", "yaw_deg")),
                 )
         return cls(name, time, gyro, accel, temperatures, attitude, oven)
+
+
+def _attribute(dataset: xr.Dataset, path: Path, name: str) -> float:
+    try:
+        value = float(dataset.attrs[name])
+    except (TypeError, ValueError):
+        value = np.nan
+    if not np.isfinite(value):
+        raise InputError(path, f"attribute '{name}'", f"is {dataset.attrs[name]!r}", "give a number")
+    return value
 
 
 @dataclass(frozen=True)
@@ -277,7 +287,13 @@ class References:
         with open_dataset(path) as dataset:
             wavenumber = take(dataset, path, "wavenumber", ("wavenumber",), "m-1")
             radiance = take(dataset, path, "radiance", ("reference", "wavenumber"), None)
+            if "reference" not in dataset.coords:
+                raise InputError(path, "coordinate 'reference'", "is missing", "name the spectra: reference(reference)")
             names = tuple(str(v) for v in dataset["reference"].values)
+        if repeated := sorted({n for n in names if names.count(n) > 1}):
+            raise InputError(
+                path, "coordinate 'reference'", f"'{repeated[0]}' occurs twice", "give each spectrum its own name"
+            )
         order = np.argsort(wavenumber)
         return cls(names, wavenumber[order], radiance[:, order])
 
@@ -321,6 +337,8 @@ def _number(row: dict[str, str], name: str, path: Path, low: float = -np.inf, hi
         value = float(row[name])
     except ValueError:
         raise InputError(path, place, f"'{row[name]}' is not a number", "correct it") from None
+    if not np.isfinite(value):
+        raise InputError(path, place, f"is {row[name]}", "give a finite number")
     if not (low <= value <= high):
         raise InputError(
             path, place, f"{value:g} is outside {low:g} to {high:g}", "columns may be swapped: correct the value"
@@ -381,6 +399,11 @@ class Gcps:
             "sigma_px": (1e-6, 1e3),
             "frame": (0.0, 1e9),
         }
+        for r in rows:
+            if not _number(r, "frame", path).is_integer():
+                raise InputError(
+                    path, f"line {r['#']}, column frame", f"'{r['frame']}' is no whole number", "give the frame's index"
+                )
         value = {n: np.array([_number(r, n, path, *limits.get(n, (-np.inf, np.inf))) for r in rows]) for n in names}
         return cls(
             value["frame"].astype(np.int64),

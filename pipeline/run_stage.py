@@ -15,8 +15,10 @@ code_digest         digest of a module and all of the project's modules that it 
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
 import importlib.util
+import inspect
 import json
 import os
 import shutil
@@ -28,7 +30,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, TsmftisError
 
 PACKAGES = ("tsmftis", "pipeline", "stages", "flows")
 FOLDER = ".stages"
@@ -43,19 +45,19 @@ class StageRecord:
 
     stage: str
     unit: str
-    status: str  # done, or failed
+    status: str  # done, failed, or skipped because a stage before it was not done
     cached: bool
     seconds: float  # of the run that made the outputs
     digest: str  # the key
     summary: dict[str, Any]
-    error: str | None = None
+    problem: TsmftisError | None = None
 
 
 def run_stage(
     out: Path,
     stage: str,
     unit: str,
-    module: str,
+    modules: tuple[str, ...],
     parameters: Any,
     inputs: Mapping[str, Path],
     outputs: Mapping[str, str],
@@ -64,7 +66,7 @@ def run_stage(
     force: bool = False,
     forbid: bool = False,
 ) -> StageRecord:
-    """Run `work` unless its outputs are there and current.
+    """Run `work` unless its outputs are there and current. `modules`: whose code makes the outputs, besides `work` itself.
 
     parameters: JSON data of everything that is no file; inputs: files by name; outputs: name → path relative to `out`.
     `work` gets output name → temporary path to write to and returns a small JSON summary, which is kept in the manifest.
@@ -79,7 +81,7 @@ def run_stage(
                 "parameters": parameters,
                 "outputs": dict(outputs),
                 "inputs": {n: file_digest(p) for n, p in sorted(inputs.items())},
-                "code": code_digest(module),
+                "code": [*map(code_digest, modules), _digest_text(inspect.getsource(work))],
             },
             sort_keys=True,
         )
@@ -95,6 +97,8 @@ def run_stage(
         )
     manifest.parent.mkdir(parents=True, exist_ok=True)
     manifest.unlink(missing_ok=True)
+    for left_behind in manifest.parent.glob(f"{manifest.stem}.*.tmp"):
+        shutil.rmtree(left_behind, ignore_errors=True)
     scratch = manifest.with_suffix(f".{os.getpid()}.{threading.get_ident()}.tmp")
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
@@ -113,6 +117,8 @@ def run_stage(
         write_json(manifest, record)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+        with contextlib.suppress(OSError):  # not empty: it is kept
+            manifest.parent.rmdir()
     return StageRecord(stage, unit, "done", False, seconds, key, summary)
 
 
@@ -131,7 +137,7 @@ def _current(manifest: Path, key: str, out: Path) -> dict[str, Any] | None:
         return None
     if not isinstance(record, dict) or record.get("key") != key:
         return None
-    for relative, digest in record["outputs"].items():
+    for relative, digest in record.get("outputs", {"": None}).items():
         path = out / relative
         if not path.is_file() or file_digest(path) != digest:
             return None
@@ -172,6 +178,8 @@ def code_digest(module: str) -> str:
             continue
         source = Path(spec.origin).read_text(encoding="utf-8")
         seen[name] = _digest_text(source)
+        if "." in name:
+            todo.append(name.rpartition(".")[0])
         todo.extend(_imports(ast.parse(source)))
     return _digest_text(json.dumps(sorted(seen.items())))
 

@@ -14,9 +14,6 @@ from unittest.mock import patch
 
 import pytest
 
-# pytest puts this folder first on the path, where tests/tsmftis would hide the package of that name.
-sys.path[:] = [p for p in sys.path if Path(p).resolve() != Path(__file__).parent.resolve()]
-
 
 @dataclass(frozen=True)
 class Answer:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -70,12 +72,15 @@ def run(
         )
     if plan.out.exists() and not plan.out.is_dir():
         raise InputError(out, "--out", "is a file", "give a folder")
-    if plan.out == plan.campaign or plan.campaign.is_relative_to(plan.out):
+    if plan.campaign.is_relative_to(plan.out) or plan.out.is_relative_to(plan.campaign):
         raise InputError(out, "--out", "would write into the campaign's own place", "give another folder")
     inspection = check_campaign(opened)
     for warning in inspection.warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False)
-    plan.out.mkdir(parents=True, exist_ok=True)
+    try:
+        plan.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(out, "--out", f"cannot be made ({error.strerror})", "give another folder") from error
 
     started = time.perf_counter()
     # Prefect takes seconds to import: bad input has been answered by now.
@@ -84,17 +89,27 @@ def run(
     from pipeline.report import write_report
 
     def say(record: StageRecord) -> None:
-        status = "failed" if record.status == "failed" else "unchanged" if record.cached else f"{record.seconds:.1f} s"
+        took = "unchanged" if record.cached else f"{record.seconds:.1f} s"
+        status = took if record.status == "done" else record.status
         console.print(f"{record.stage:<15}{record.unit:<18}{status}", markup=False)
-        if record.error:
-            console.print(f"  {record.error}", style="red", markup=False)
+        if record.problem and not isinstance(record.problem, InputError):
+            console.print(f"  {record.problem}", style="red", markup=False)
 
     records = run_campaign(plan, say, dask)
-    content = assemble(plan, records)
+    wrong_input = next((record.problem for record in records if isinstance(record.problem, InputError)), None)
+    if wrong_input and not any(record.status == "done" and not record.cached for record in records):
+        # Nothing came of the run, so nothing is left of it either.
+        with contextlib.suppress(OSError):
+            plan.out.rmdir()
+        raise wrong_input
+    # In the order that run.json has, so that report and table do not hang on what was computed and what was read back.
+    content = json.loads(json.dumps(assemble(plan, records), sort_keys=True))
     write_run(plan, content)
     report = write_report(opened, plan.out, content, settings.model_dump(mode="json"), inspection.warnings)
     print_scores(console, content)
     console.print(f"report: {_short(report)}   ({time.perf_counter() - started:.0f} s)", markup=False)
+    if wrong_input:
+        raise wrong_input
     if any(record.status == "failed" for record in records):
         raise typer.Exit(1)
 

@@ -30,7 +30,7 @@ def simulate(
     """Simulate a campaign: flight, inertial data with thermal errors, GNSS, terrain, scene, frames, chamber runs, truth."""
     from stages import simulation
 
-    settings = validate(simulation.SimulationSettings, load_preset(preset), preset)
+    settings = validate(simulation.SimulationSettings, load_preset(preset), preset, "see configs/simulation/demo.yaml")
     for folder in (out, out.with_name(out.name + "-truth")):
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError(folder, "folder", "exists and is not empty", "give another name or remove it")

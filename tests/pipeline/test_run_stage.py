@@ -39,7 +39,7 @@ def stage(out: Path, source: Path, parameters: Any = None, work: Work | None = N
         out,
         "copying",
         "F1/L01",
-        "stages.scoring",
+        ("stages.scoring",),
         parameters,
         {"source": source},
         {"copy": "F1/L01/copy.txt"},
