@@ -20,7 +20,7 @@ from prefect.futures import PrefectFuture, as_completed
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from flows import steps
-from flows.steps import Plan
+from flows.steps import NEEDS, Plan
 from pipeline.errors import InputError, TsmftisError
 from pipeline.run_stage import StageRecord
 
@@ -47,28 +47,32 @@ def run_step(plan: Plan, stage: str, unit: str, before: list[StageRecord]) -> St
 
 @dataclass
 class _Graph:
-    """Tasks in the order of submission; a task waits for those before it in its own unit's chain."""
+    """Tasks in the order of submission; each waits for those of the stages that its own needs, in its own unit or above it."""
 
     plan: Plan
     futures: list[Future] = field(default_factory=list)
+    by_stage: dict[tuple[str, str], Future] = field(default_factory=dict)
 
-    def submit(self, stage: str, unit: str, after: list[Future]) -> list[Future]:
+    def submit(self, stage: str, unit: str) -> None:
         if not self.plan.does(stage):
-            return after
+            return
+        flight = unit.split("/")[0]
+        waits = [self.by_stage.get((need, where)) for need in NEEDS[stage] for where in (unit, flight, "campaign")]
+        before = [future for future in waits if future is not None]
         # Futures among the arguments are waited for and handed over as what they came to.
-        future = run_step.submit(plan=self.plan, stage=stage, unit=unit, before=after, return_state=False)
+        future = run_step.submit(plan=self.plan, stage=stage, unit=unit, before=before, return_state=False)
         self.futures.append(future)
-        return [future]
+        self.by_stage[stage, unit] = future
 
-    def line(self, flight: str, line: str, after: list[Future]) -> None:
+    def line(self, flight: str, line: str) -> None:
         for stage in LINE_STAGES:
-            after = self.submit(stage, f"{flight}/{line}", after)
+            self.submit(stage, f"{flight}/{line}")
 
-    def flight(self, flight: str, after: list[Future]) -> None:
-        after = self.submit("navigation", flight, after)
+    def flight(self, flight: str) -> None:
+        self.submit("navigation", flight)
         for line in self.plan.opened.flight(flight).lines:
             if self.plan.wants(flight, line.id):
-                self.line(flight, line.id, after)
+                self.line(flight, line.id)
 
     def results(self, listener: Listener | None) -> list[StageRecord]:
         """Records in the order of submission, failed and skipped ones among them; `listener` hears of each as it ends."""
@@ -87,7 +91,7 @@ class _Graph:
 def line_flow(plan: Plan, flight: str, line: str, listener: Listener | None = None) -> list[StageRecord]:
     """The stages of one line, on the flight's trajectory as it is."""
     graph = _Graph(plan)
-    graph.line(flight, line, [])
+    graph.line(flight, line)
     return graph.results(listener)
 
 
@@ -95,7 +99,7 @@ def line_flow(plan: Plan, flight: str, line: str, listener: Listener | None = No
 def flight_flow(plan: Plan, flight: str, listener: Listener | None = None) -> list[StageRecord]:
     """Navigation and the lines of one flight, on the thermal model as it is."""
     graph = _Graph(plan)
-    graph.flight(flight, [])
+    graph.flight(flight)
     return graph.results(listener)
 
 
@@ -104,12 +108,14 @@ def campaign_flow(plan: Plan, listener: Listener | None = None) -> list[StageRec
     """Thermal model, flights, lines and bench interferograms of a campaign."""
     graph = _Graph(plan)
     keys = plan.opened.keys
-    thermal = graph.submit("thermal", "campaign", []) if keys.thermal is not None else []
+    if keys.thermal is not None:
+        graph.submit("thermal", "campaign")
     for flight in keys.flights:
         if not plan.lines or any(plan.wants(flight.id, entry.id) for entry in flight.lines):
-            graph.flight(flight.id, thermal)
+            graph.flight(flight.id)
     for bench in keys.bench:
-        graph.submit("bench", bench.id, [])
+        if not plan.lines:
+            graph.submit("bench", bench.id)
     return graph.results(listener)
 
 

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import platform
+from collections.abc import Iterable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flows.steps import STAGES, Plan
-from pipeline.run_stage import FOLDER, StageRecord, write_json
-from stages.scoring import campaign_means
+from pipeline.run_stage import StageRecord, earlier_records, write_json
 from tsmftis import __version__
 
 SCHEMA = "tsmftis-run/1"
+SCORES = ("rqe", "rqe_area")
 PACKAGES = ("numpy", "scipy", "torch", "numba", "opencv-python-headless", "rasterio", "xarray", "prefect")
 
 
 def assemble(plan: Plan, records: list[StageRecord]) -> dict[str, Any]:
     """The content of run.json from this run's records and, for units it did not touch, from those of earlier runs."""
-    known = _earlier(plan.out) | {(r.stage, r.unit): r for r in records}
+    known = {(r.stage, r.unit): r for r in [*earlier_records(plan.out), *records]}
     keys = plan.opened.keys
     units = _units(plan)
     stages: dict[str, dict[str, Any]] = {}
@@ -88,21 +90,6 @@ def _units(plan: Plan) -> dict[str, list[str]]:
     return {stage: special.get(stage, lines) for stage in STAGES}
 
 
-def _earlier(out: Path) -> dict[tuple[str, str], StageRecord]:
-    found = {}
-    for path in sorted((out / FOLDER).glob("*.json")):
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError:
-            continue
-        stage, _, unit = path.stem.partition("@")
-        unit = unit.replace("@", "/")
-        found[stage, unit] = StageRecord(
-            stage, unit, "done", True, content["seconds"], content["key"], content["summary"]
-        )
-    return found
-
-
 def _provenance(plan: Plan) -> dict[str, Any]:
     return {
         "tsmftis": __version__,
@@ -110,3 +97,13 @@ def _provenance(plan: Plan) -> dict[str, Any]:
         "packages": {name: version(name) for name in PACKAGES},
         "settings": plan.settings.model_dump(mode="json"),
     }
+
+
+def campaign_means(lines: Iterable[Mapping[str, Mapping[str, Mapping[str, Any]]]]) -> dict[str, dict[str, float]]:
+    """Means over all targets of all lines, {kind: {method: mean}}, from the lines' `scores`."""
+    pooled: dict[str, dict[str, list[float]]] = {kind: {} for kind in SCORES}
+    for scores in lines:
+        for kind in SCORES:
+            for method, entry in scores.get(kind, {}).items():
+                pooled[kind].setdefault(method, []).extend(entry["targets"].values())
+    return {kind: {m: float(np.mean(v)) for m, v in methods.items() if v} for kind, methods in pooled.items()}

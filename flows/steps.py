@@ -29,7 +29,24 @@ from stages import bench as bench_stage
 from stages import mapping, navigation, reconstruction, registration, scoring, thermal, tracking
 from tsmftis.fourier import smooth_phase
 
-STAGES = ("thermal", "navigation", "tracking", "registration", "reconstruction", "mapping", "scoring", "bench")
+# Each stage and the stages whose results it reads, in the order in which a reader should meet them.
+NEEDS: Mapping[str, tuple[str, ...]] = {
+    "thermal": (),
+    "navigation": ("thermal",),
+    "tracking": ("navigation",),
+    "registration": ("tracking",),
+    "reconstruction": ("registration",),
+    "mapping": ("tracking", "reconstruction"),
+    "scoring": ("reconstruction",),
+    "bench": (),
+}
+STAGES = tuple(NEEDS)
+
+
+def reaches(stage: str, later: str) -> bool:
+    """Whether `later` is `stage` or hangs on its result."""
+    return stage == later or any(reaches(stage, before) for before in NEEDS[later])
+
 
 Paths = Mapping[str, Path]
 
@@ -54,12 +71,12 @@ class Plan:
 
     def does(self, stage: str) -> bool:
         """Whether a stage is looked at: with --only, the stages up to that one, and only it may run."""
-        return self.only is None or STAGES.index(stage) <= STAGES.index(self.only)
+        return self.only is None or reaches(stage, self.only)
 
     def switches(self, stage: str) -> dict[str, bool]:
         if self.only is not None:
             return {"force": stage == self.only, "forbid": stage != self.only}
-        return {"force": self.start is not None and STAGES.index(stage) >= STAGES.index(self.start), "forbid": False}
+        return {"force": self.start is not None and reaches(self.start, stage), "forbid": False}
 
 
 def _plain(value: Any) -> Any:
@@ -136,13 +153,13 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         write_dataset(result.trajectory.to_dataset(), to["trajectory"])
         sbet.write_sbet(sbet.from_trajectory(result.trajectory), to["sbet"])
         write_json(to["figures"], {"quality": result.quality, "figures": result.figures})
-        return result.quality | {"compensated": compensated}
+        return result.quality | {"compensated": compensated} | (_reach(correction) if correction is not None else {})
 
     return run_stage(
         plan.out,
         "navigation",
         flight,
-        ("stages.navigation", "pipeline.formats.sbet"),
+        ("stages.navigation", "stages.thermal", "pipeline.formats.sbet"),
         {
             "settings": _plain(plan.settings.navigation),
             "imu": _plain(instrument.imu),
@@ -227,7 +244,7 @@ def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
         "registration",
         f"{flight}/{line}",
         ("stages.registration",),
-        {"settings": _plain(plan.settings.registration)},
+        {"settings": _plain(plan.settings.registration), "camera": _plain(camera)},
         {"tracks": _needed(source, "tracking"), "frames": campaign.path(campaign.line(flight, line).frames)},
         {"tracks": f"{flight}/{line}/tracks.nc"},
         work,
@@ -303,16 +320,11 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
         assert camera is not None and interferometer is not None
         targets, poses = campaign.targets(flight, line), CameraPoses.from_file(folder / "poses.nc")
         dem = None if campaign.keys.dem is None else Dem.from_file(inputs["dem"])
-        flat = float(targets.height.mean())
-        heights = (lambda lat, lon: np.full(np.shape(lat), flat)) if dem is None else dem.height
-        ground = flat if dem is None else float(dem.height(targets.latitude, targets.longitude).mean())
+        heights, ground = mapping.surface(targets, dem)
         grid = mapping.line_grid(poses, camera, ground, settings)
-        scored = interferometer.scored_wavenumbers()
-        coefficients = np.array(
-            [float(c) for c in str(Spectra.from_file(folder / "spectra.nc").attributes["phase_coefficients"]).split()]
-        )
+        spectra = Spectra.from_file(folder / "spectra.nc")
         wavenumber = interferometer.scored_wavenumbers(settings.wavenumber_step_per_m)
-        phase = smooth_phase(coefficients, wavenumber, (scored[0], scored[-1]))
+        phase = smooth_phase(spectra.phase, wavenumber, (spectra.wavenumber[0], spectra.wavenumber[-1]))
         quicklook = Quicklook(grid.shape, wavenumber)
         with open_cube(to["cube"], grid.crs, Affine(*grid.affine), grid.shape, 1e9 / wavenumber) as cube:
             for start, strip in mapping.run(
@@ -336,7 +348,7 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
             "crs": grid.crs,
             "bands": wavenumber.size,
             "seen_fraction": quicklook.seen_fraction,
-            "terrain": "dem" if dem is not None else f"flat at {flat:.1f} m",
+            "terrain": "dem" if dem is not None else f"flat at {ground:.1f} m",
         }
 
     return run_stage(
@@ -385,7 +397,8 @@ def bench_step(plan: Plan, bench: str) -> StageRecord:
     entry = next(b for b in campaign.keys.bench if b.id == bench)
 
     def work(to: Paths) -> dict[str, Any]:
-        result = bench_stage.run(campaign.bench(bench), plan.settings.bench)
+        with _naming(bench=campaign.path(entry.file)):
+            result = bench_stage.run(campaign.bench(bench), plan.settings.bench)
         write_dataset(result.to_dataset(), to["spectrum"])
         return {
             "relative_rms": result.relative_rms,
@@ -420,6 +433,16 @@ def _has_temperatures(campaign: Campaign, flight: str) -> bool:
 def _correction(model: Path, imu: Imu) -> ThermalCorrection:
     assert imu.temperatures is not None
     return thermal.ThermalModel.from_file(model).correction(imu.temperatures)
+
+
+def _reach(correction: ThermalCorrection) -> dict[str, Any]:
+    """Channels that were not compensated, and how far the flight left what the chamber taught, for a reader to know."""
+    values = np.hstack([correction.gyro, correction.accel])
+    names = [f"{sensor} {axis}" for sensor in ("gyro", "accel") for axis in "xyz"]
+    return {
+        "uncompensated": [n for n, column in zip(names, values.T, strict=True) if not column.any()],
+        "chamber_distance_max": float(correction.distance.max()),
+    }
 
 
 def _initial(campaign: Campaign, flight: str) -> tuple[float, np.ndarray, np.ndarray] | None:

@@ -6,6 +6,7 @@ first problem, so that a run over bad input ends before it has written anything.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -146,6 +147,13 @@ def _describe_shared(campaign: Campaign, found: Inspection) -> None:
                 cells="{} × {}".format(*dem.heights.shape),
                 heights=f"{dem.heights.min():.1f} to {dem.heights.max():.1f} m",
             )
+            for flight, line in ((f.id, entry.id) for f in keys.flights for entry in f.lines):
+                with contextlib.suppress(InputError):  # said of the line itself, below
+                    targets = campaign.targets(flight, line)
+                    if not dem.covers(targets.latitude, targets.longitude).all():
+                        found.warnings.append(
+                            f"line {flight}/{line}: the terrain model does not reach all targets: its edge holds on"
+                        )
 
 
 def _covers(campaign: Campaign, name: str, variable: str, wavenumber: np.ndarray) -> None:
@@ -284,6 +292,7 @@ def _describe_line(
         found.add(
             part,
             frames=f"{frames.time.size} in {np.ptp(frames.time):.2f} s",
+            missing=f"{len(frames.segments()) - 1} gaps",
             counts=f"{last.min()} to {last.max()} DN in the middle frame, {saturated:.1%} saturated",
         )
         if imu is not None:

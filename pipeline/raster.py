@@ -22,7 +22,7 @@ WGS84 = "EPSG:4326"
 
 @dataclass(frozen=True)
 class Dem:
-    """Ellipsoidal heights (row, col) [m] on a raster of any CRS; `constant` surfaces have no raster."""
+    """Ellipsoidal heights (row, col) [m] on a raster of any CRS."""
 
     heights: Array
     inverse: Affine
@@ -62,22 +62,35 @@ class Dem:
             if rasterio.crs.CRS.from_user_input(self.crs) == rasterio.crs.CRS.from_epsg(4326)
             else map(np.array, warp(WGS84, self.crs, lon, lat))
         )
-        col, row = self.inverse * (x, y)
+        col, row = self._cell(x, y)
         # Pixel centres lie half a pixel inside the corner that the transform refers to.
         at = map_coordinates(self.heights, [np.asarray(row) - 0.5, np.asarray(col) - 0.5], order=1, mode="nearest")
         return at.reshape(np.shape(latitude))
 
-    def covers(self, latitude: float, longitude: float) -> bool:
-        """Whether a geodetic position [rad] lies on the raster."""
-        (x,), (y,) = warp(WGS84, self.crs, [float(np.rad2deg(longitude))], [float(np.rad2deg(latitude))])
-        col, row = self.inverse * (x, y)
-        return 0 <= col <= self.heights.shape[1] and 0 <= row <= self.heights.shape[0]
+    def covers(self, latitude: Array, longitude: Array) -> NDArray[np.bool_]:
+        """Whether geodetic positions (n,) [rad] lie on the raster."""
+        x, y = warp(WGS84, self.crs, np.rad2deg(longitude), np.rad2deg(latitude))
+        col, row = self._cell(np.array(x), np.array(y))
+        return (col >= 0) & (col <= self.heights.shape[1]) & (row >= 0) & (row <= self.heights.shape[0])
+
+    def _cell(self, x: Array, y: Array) -> tuple[Array, Array]:
+        t = self.inverse
+        return t.a * x + t.b * y + t.c, t.d * x + t.e * y + t.f
 
 
 def utm_crs(latitude: float, longitude: float) -> str:
     """EPSG code of the WGS-84 UTM zone of a position [rad]."""
     zone = int((np.rad2deg(longitude) + 180.0) // 6.0) % 60 + 1
     return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+
+
+def is_metric(crs: str) -> bool:
+    """Whether a CRS is known, projected, and in metres."""
+    try:
+        known = rasterio.crs.CRS.from_user_input(crs)
+    except rasterio.errors.CRSError:
+        return False
+    return bool(known.is_projected and known.linear_units in ("metre", "meter"))
 
 
 def to_crs(crs: str, latitude: Array, longitude: Array) -> tuple[Array, Array]:

@@ -7,6 +7,7 @@ itself with `to_dataset`. Shapes: n samples in time, m temperature samples, k th
 from __future__ import annotations
 
 import csv
+import itertools
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,6 +22,7 @@ from tsmftis.interferometer import Interferometer
 
 Array = NDArray[np.float64]
 
+FRAME_DROP = 1.5  # an interval longer than this many usual ones means frames are missing
 GNSS_QUALITIES = {1: "fixed", 2: "float", 5: "single"}
 
 
@@ -195,7 +197,14 @@ class Gnss:
             if unknown := sorted(set(quality.tolist()) - set(GNSS_QUALITIES)):
                 raise InputError(path, "variable 'quality'", f"has values {unknown}", "use 1 fixed, 2 float, 5 single")
         return cls(
-            time, np.deg2rad(latitude), np.deg2rad(longitude), height, sigma_position, velocity, sigma_velocity, quality
+            time,
+            np.deg2rad(latitude),
+            np.unwrap(np.deg2rad(longitude)),  # continuous across the date line, so that differences are what they seem
+            height,
+            sigma_position,
+            velocity,
+            sigma_velocity,
+            quality,
         )
 
 
@@ -233,6 +242,14 @@ class Frames:
                 path, "variable 'frames'", "cannot be read to its end", "the file is truncated: copy it again"
             ) from error
         return cls(time, counts.variable)
+
+    def segments(self, start: int = 0, stop: int | None = None) -> list[tuple[int, int]]:
+        """Runs (first, one past last) without a dropped frame inside; values are not interpolated across a drop."""
+        stop = self.time.size if stop is None else stop
+        step = np.diff(self.time)
+        drops = np.flatnonzero(step > FRAME_DROP * np.median(step)) + 1
+        edges = [start, *(int(i) for i in drops if start < i < stop), stop]
+        return list(itertools.pairwise(edges))
 
     def block(self, start: int, stop: int) -> NDArray[np.uint16]:
         """Frames start:stop in memory."""
@@ -508,8 +525,6 @@ class Trajectory:
     rate: Array
     specific_force: Array
 
-    DEGREES = ("latitude", "longitude")
-
     def to_dataset(self) -> xr.Dataset:
         time, ned, axis = ("time",), ("time", "ned"), ("time", "axis")
         deg = np.rad2deg
@@ -635,6 +650,7 @@ class Spectra:
     """Spectra as scored: radiance and its sigma (method, target, wavenumber), of the centre and of the area mean.
 
     `reference` (target, wavenumber) has gone the same way (window, transform); NaN where a target has none.
+    `phase`: coefficients of φ(u), u ∈ [−1, 1] over the wavenumbers, lowest first [rad].
     `points` (method, target) counts the points of the area that were seen well enough; a spectrum is NaN where too few.
     """
 
@@ -647,6 +663,7 @@ class Spectra:
     sigma_radiance_area: Array
     reference: Array
     points: NDArray[np.int64]
+    phase: Array
     attributes: dict[str, str | float] = field(default_factory=dict)
 
     SPECTRA = ("radiance", "sigma_radiance", "radiance_area", "sigma_radiance_area")
@@ -658,6 +675,11 @@ class Spectra:
             {
                 **{n: (dims, getattr(self, n), unit) for n in self.SPECTRA},
                 "reference": (dims[1:], self.reference, unit | {"long_name": "reference at the scored line shape"}),
+                "phase": (
+                    ("order",),
+                    self.phase,
+                    {"units": "rad", "long_name": "coefficients of the instrument's phase"},
+                ),
                 "points": (
                     dims[:2],
                     self.points,
@@ -684,6 +706,7 @@ class Spectra:
                 **spectra,
                 reference=take(d, path, "reference", dims[1:], None, finite=False),
                 points=take(d, path, "points", dims[:2], "1").astype(np.int64),
+                phase=take(d, path, "phase", ("order",), None),
                 attributes={str(k): v for k, v in d.attrs.items()},
             )
 

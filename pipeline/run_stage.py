@@ -8,6 +8,7 @@ all lead to the stage being run again, and nothing else does.
 Functions
 ---------
 run_stage           run or reuse
+earlier_records     what earlier runs left that still holds
 file_digest         digest of a file or of a folder (Zarr)
 code_digest         digest of a module and all of the project's modules that it imports
 """
@@ -17,10 +18,11 @@ from __future__ import annotations
 import ast
 import contextlib
 import hashlib
+import importlib.metadata
 import importlib.util
-import inspect
 import json
 import os
+import re
 import shutil
 import threading
 import time
@@ -33,6 +35,7 @@ from typing import Any
 from pipeline.errors import InputError, TsmftisError
 
 PACKAGES = ("tsmftis", "pipeline", "stages", "flows")
+LIBRARIES = ("h5py", "numba", "numpy", "opencv-python-headless", "rasterio", "scipy", "torch")
 FOLDER = ".stages"
 
 _known_digests: dict[tuple[str, int, int], str] = {}
@@ -81,7 +84,8 @@ def run_stage(
                 "parameters": parameters,
                 "outputs": dict(outputs),
                 "inputs": {n: file_digest(p) for n, p in sorted(inputs.items())},
-                "code": [*map(code_digest, modules), _digest_text(inspect.getsource(work))],
+                "code": [*map(code_digest, modules), _source_digest(work.__module__)],
+                "versions": _versions(),
             },
             sort_keys=True,
         )
@@ -97,8 +101,9 @@ def run_stage(
         )
     manifest.parent.mkdir(parents=True, exist_ok=True)
     manifest.unlink(missing_ok=True)
-    for left_behind in manifest.parent.glob(f"{manifest.stem}.*.tmp"):
-        shutil.rmtree(left_behind, ignore_errors=True)
+    for left_behind in manifest.parent.iterdir():
+        if re.fullmatch(re.escape(manifest.stem) + r"\.\d+\.\d+\.tmp", left_behind.name):
+            shutil.rmtree(left_behind, ignore_errors=True)
     scratch = manifest.with_suffix(f".{os.getpid()}.{threading.get_ident()}.tmp")
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
@@ -113,13 +118,33 @@ def run_stage(
             final = out / relative
             final.parent.mkdir(parents=True, exist_ok=True)
             os.replace(paths[name], final)
-        record = {"key": key, "seconds": seconds, "summary": summary, "outputs": digests}
+        record = {
+            "key": key,
+            "seconds": seconds,
+            "summary": summary,
+            "outputs": digests,
+            "inputs": {os.path.relpath(path, out): file_digest(path) for path in inputs.values()},
+        }
         write_json(manifest, record)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
         with contextlib.suppress(OSError):  # not empty: it is kept
             manifest.parent.rmdir()
     return StageRecord(stage, unit, "done", False, seconds, key, summary)
+
+
+def earlier_records(out: Path) -> list[StageRecord]:
+    """Records of runs into `out` whose outputs are there and whose inputs are still those that they were made from."""
+    found = []
+    for manifest in sorted((out / FOLDER).glob("*.json")):
+        stage, _, unit = manifest.stem.partition("@")
+        record = _read(manifest)
+        if record and _agree(out, record.get("outputs")) and _agree(out, record.get("inputs")):
+            summary = record["summary"]
+            found.append(
+                StageRecord(stage, unit.replace("@", "/"), "done", True, record["seconds"], record["key"], summary)
+            )
+    return found
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -130,18 +155,24 @@ def write_json(path: Path, content: Any) -> None:
     os.replace(temporary, path)
 
 
-def _current(manifest: Path, key: str, out: Path) -> dict[str, Any] | None:
+def _read(manifest: Path) -> dict[str, Any] | None:
     try:
         record = json.loads(manifest.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    if not isinstance(record, dict) or record.get("key") != key:
-        return None
-    for relative, digest in record.get("outputs", {"": None}).items():
-        path = out / relative
-        if not path.is_file() or file_digest(path) != digest:
-            return None
-    return record
+    return record if isinstance(record, dict) else None
+
+
+def _agree(out: Path, digests: dict[str, str] | None) -> bool:
+    """Whether all files, relative to `out`, are there with these digests."""
+    if not digests:
+        return False
+    return all((out / name).exists() and file_digest(out / name) == digest for name, digest in digests.items())
+
+
+def _current(manifest: Path, key: str, out: Path) -> dict[str, Any] | None:
+    record = _read(manifest)
+    return record if record and record.get("key") == key and _agree(out, record.get("outputs")) else None
 
 
 def _digest_text(text: str) -> str:
@@ -163,6 +194,19 @@ def file_digest(path: Path) -> str:
     with _lock:
         _known_digests[tag] = digest
     return digest
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Of the libraries that figures hang on: another version may give other figures."""
+    known = {d.metadata["Name"].lower(): d.version for d in importlib.metadata.distributions() if d.metadata["Name"]}
+    return {name: known[name] for name in LIBRARIES if name in known}
+
+
+@cache
+def _source_digest(module: str) -> str:
+    spec = importlib.util.find_spec(module)
+    return _digest_text(Path(spec.origin).read_text(encoding="utf-8")) if spec and spec.origin else ""
 
 
 @cache

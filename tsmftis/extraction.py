@@ -108,6 +108,8 @@ def over_cells(
             y = (dcm[k, 0, 1] * dx + dcm[k, 1, 1] * dy + dcm[k, 2, 1] * dz) / z
             s = (1.0 + k1 * (x * x + y * y)) * scale
             r1, c1 = row0 + s * y, col0 - s * x
+            if z <= 0.0:  # behind the camera
+                c1 = np.nan
             if k > 0:
                 _cross(frames, k - 1, r0, c0, r1, c1, value[p], gain[p], weight[p], mean_row[p])
             r0, c0 = r1, c1

@@ -108,11 +108,9 @@ def remove_constant(interferogram: Array, opd: Array, order: int) -> Array:
     """
     opd = np.asarray(opd, float)
     u = (opd - opd.mean(axis=-1, keepdims=True)) / np.ptp(opd, axis=-1)[..., None] * 2.0
-    basis = np.stack([u**k for k in range(order + 1)], -1)
-    if basis.ndim == 2:
-        q, _ = np.linalg.qr(basis)
+    q, _ = np.linalg.qr(np.stack([u**k for k in range(order + 1)], -1))
+    if q.ndim == 2:
         return interferogram - (interferogram @ q) @ q.T
-    q, _ = np.linalg.qr(basis)
     drift: Array = np.einsum("...nk,...k->...n", q, np.einsum("...nk,...n->...k", q, interferogram))
     return interferogram - drift
 
@@ -234,7 +232,7 @@ def line_shape_response(
     step = 0.2 / table_wavenumber[-1]  # five samples a period of the shortest wave
     count = int(np.ceil(longest_opd / step))
     x = np.linspace(0.0, longest_opd, count + 1)
-    forward = np.cos(2.0 * np.pi * np.outer(table_wavenumber, x)) * (response * np.gradient(table_wavenumber))[:, None]
+    forward = np.cos(2.0 * np.pi * np.outer(table_wavenumber, x)) * (response * quadrature(table_wavenumber))[:, None]
     dx = np.full(x.size, x[1])
     dx[[0, -1]] *= 0.5
     back = np.cos(2.0 * np.pi * np.outer(x, wavenumber)) * (apodization(name, x / longest_opd) * dx)[:, None]

@@ -115,7 +115,7 @@ def local_metres(
     return np.stack(
         [
             (latitude - latitude0) * (north + height0),
-            (longitude - longitude0) * (east + height0) * np.cos(latitude0),
+            ((longitude - longitude0 + np.pi) % (2.0 * np.pi) - np.pi) * (east + height0) * np.cos(latitude0),
             -(height - height0),
         ],
         -1,

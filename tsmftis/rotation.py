@@ -7,7 +7,6 @@ exp_so3                     rotation vector → DCM
 log_so3                     DCM → rotation vector
 dcm_to_quaternion, quaternion_to_dcm
 rpy_jacobian                errors of roll, pitch, yaw from a rotation error in NED
-skew                        cross-product matrix
 Attitude                    an attitude history, interpolated smoothly in time
 
 References
@@ -86,14 +85,6 @@ def rpy_jacobian(rpy: Array) -> Array:
         ],
         -2,
     )
-
-
-def skew(v: Array) -> Array:
-    """[v×] with [v×]w = v × w; (..., 3) → (..., 3, 3)."""
-    v = np.asarray(v, float)
-    zero = np.zeros(v.shape[:-1])
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    return np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2)
 
 
 @dataclass(frozen=True)

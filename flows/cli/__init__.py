@@ -51,9 +51,14 @@ def main() -> None:
             raise
         print(f"tsmftis: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        print("tsmftis: interrupted; the same command takes the run up where it was", file=sys.stderr)
-        sys.exit(130)
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(1)
+    except OSError as error:
+        if os.environ.get("TSMFTIS_DEBUG"):
+            raise
+        print(f"tsmftis: {error.filename or 'file system'}: {error.strerror or error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("tsmftis: interrupted; the same command takes the run up where it was", file=sys.stderr)
+        sys.exit(130)

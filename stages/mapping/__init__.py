@@ -1,5 +1,5 @@
 """Mapping: the georeferenced radiance cube of a line."""
 
-from stages.mapping.cube import MapGrid, MappingSettings, line_grid, run
+from stages.mapping.cube import MappingSettings, line_grid, run, surface
 
-__all__ = ["MapGrid", "MappingSettings", "line_grid", "run"]
+__all__ = ["MappingSettings", "line_grid", "run", "surface"]

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from pipeline.errors import StageError
-from pipeline.raster import from_crs, to_crs, utm_crs
-from pipeline.records import Calibration, CameraPoses, Frames
+from pipeline.raster import Dem, from_crs, is_metric, to_crs, utm_crs
+from pipeline.records import Calibration, CameraPoses, Frames, Targets
 from tsmftis import detector, extraction, fourier
 from tsmftis.camera import Camera
 from tsmftis.geodesy import ecef_to_geodetic, geodetic_to_ecef
@@ -26,6 +26,8 @@ Heights = Callable[[Array, Array], Array]
 
 LEAST_SEEN = 0.97  # of the columns, for a cell to have a spectrum: the score's own rule
 EDGE_CELLS = 12  # kept beyond the ends of what the plane says is seen
+STRIP_VALUES = 4_000_000  # cells × columns worked off at a time
+BLOCK_FRAMES = 256  # frames in memory at a time
 MOST_CELLS = 200_000_000  # a grid larger than this means poses that are wrong
 
 
@@ -36,9 +38,15 @@ class MappingSettings(BaseModel):
 
     wavenumber_step_per_m: float = Field(10_000.0, gt=0, description="spacing of the bands")
     cell_m: float | None = Field(None, gt=0, description="side of a cell; default one nominal ground sample")
-    crs: str | None = Field(None, description="default: the UTM zone of the line")
-    strip_cells: int = Field(128, ge=8, description="cells along the track worked off at a time")
+    crs: str | None = Field(None, description="a projected CRS in metres; default: the UTM zone of the line")
     drift_order: int = Field(1, ge=0, le=4, description="polynomial in OPD taken off each interferogram")
+
+    @field_validator("crs")
+    @classmethod
+    def _in_metres(cls, value: str | None) -> str | None:
+        if value is not None and not is_metric(value):
+            raise ValueError(f"'{value}' is no projected CRS in metres (for instance EPSG:32651)")
+        return value
 
 
 @dataclass(frozen=True)
@@ -63,6 +71,15 @@ class MapGrid:
         a, b, c, d, e, f = self.affine
         row, col = np.meshgrid(np.arange(start, stop) + 0.5, np.arange(self.shape[1]) + 0.5, indexing="ij")
         return a * col + b * row + c, d * col + e * row + f
+
+
+def surface(targets: Targets, dem: Dem | None) -> tuple[Heights, float]:
+    """Heights of the ground as a function of latitude and longitude [rad] → [m], and its mean height at the targets [m];
+    without a terrain model a flat one at the targets' mean height."""
+    if dem is not None:
+        return dem.height, float(dem.height(targets.latitude, targets.longitude).mean())
+    flat = float(targets.height.mean())
+    return lambda latitude, longitude: np.full(np.shape(latitude), flat), flat
 
 
 def line_grid(poses: CameraPoses, camera: Camera, ground_height: float, settings: MappingSettings) -> MapGrid:
@@ -126,16 +143,39 @@ def run(
     """
     response = np.interp(wavenumber, calibration.wavenumber, calibration.response)
     window_of = _windower(interferometer, fourier.fringe_centre(phase, wavenumber))
-    centre, dcm = poses.centre, poses.dcm
-    for start in range(0, grid.shape[0], settings.strip_cells):
-        stop = min(start + settings.strip_cells, grid.shape[0])
+    # A strip's sums are four values a cell and column.
+    height = max(1, STRIP_VALUES // (grid.shape[1] * camera.cols))
+    for start in range(0, grid.shape[0], height):
+        stop = min(start + height, grid.shape[0])
         x, y = grid.centres(start, stop)
         latitude, longitude = from_crs(grid.crs, x, y)
         points = geodetic_to_ecef(latitude, longitude, heights(latitude, longitude)).reshape(-1, 3)
+        value, weight, row = _extract(points, frames, poses, calibration, camera, interferometer)
+        seen = weight > 0
+        good = np.flatnonzero(seen.mean(axis=1) >= LEAST_SEEN)
         radiance = np.full((len(points), wavenumber.size), np.nan, np.float32)
-        first, last = _frames_that_see(points, poses, camera)
-        if last - first >= 2:
-            value, gain, weight, row = (np.zeros((len(points), camera.cols)) for _ in range(4))
+        if good.size:
+            once = np.maximum(weight[good], 1.0)
+            filled = extraction.fill_gaps(value[good] / once, seen[good])
+            opd, window = window_of(extraction.fill_gaps(row[good] / once, seen[good]))
+            ac = fourier.remove_constant(filled, opd, settings.drift_order)
+            radiance[good] = fourier.radiance(ac, opd, window, wavenumber, phase, response)[0]
+        yield start, radiance.reshape(stop - start, grid.shape[1], wavenumber.size)
+
+
+def _extract(
+    points: Array,
+    frames: Frames,
+    poses: CameraPoses,
+    calibration: Calibration,
+    camera: Camera,
+    interferometer: Interferometer,
+) -> tuple[Array, Array, Array]:
+    """Sums of value, crossings and rows (point, col) over the frames that see the points, block by block."""
+    value, gain, weight, row = (np.zeros((len(points), camera.cols)) for _ in range(4))
+    for start, stop in frames.segments(*_frames_that_see(points, poses, camera)):
+        for first in range(start, stop - 1, BLOCK_FRAMES):
+            last = min(first + BLOCK_FRAMES + 1, stop)
             block = detector.correct(
                 frames.block(first, last),
                 calibration.dark,
@@ -146,8 +186,8 @@ def run(
             extraction.over_cells(
                 block,
                 points,
-                centre[first:last],
-                dcm[first:last],
+                poses.centre[first:last],
+                poses.dcm[first:last],
                 camera.focal_length / camera.pixel_pitch,
                 camera.principal_row,
                 camera.principal_col,
@@ -157,15 +197,7 @@ def run(
                 weight,
                 row,
             )
-            seen = weight > 0
-            good = np.flatnonzero(seen.mean(axis=1) >= LEAST_SEEN)
-            if good.size:
-                once = np.maximum(weight[good], 1.0)
-                filled = extraction.fill_gaps(value[good] / once, seen[good])
-                opd, window = window_of(extraction.fill_gaps(row[good] / once, seen[good]))
-                ac = fourier.remove_constant(filled, opd, settings.drift_order)
-                radiance[good] = fourier.radiance(ac, opd, window, wavenumber, phase, response)[0]
-        yield start, radiance.reshape(stop - start, grid.shape[1], wavenumber.size)
+    return value, weight, row
 
 
 def _windower(interferometer: Interferometer, centre: float) -> Callable[[Array], tuple[Array, Array]]:
@@ -199,7 +231,7 @@ def _on_plane(centre: Array, rays: Array, height: float) -> tuple[Array, Array]:
 
 def _frames_that_see(points: Array, poses: CameraPoses, camera: Camera) -> tuple[int, int]:
     """First and one past the last frame in which any of a strip's outline falls near the detector."""
-    outline = points[np.unique(np.linspace(0, len(points) - 1, 64).astype(int))]
+    outline = points[np.unique(np.linspace(0, len(points) - 1, 256).astype(int))]
     line_of_sight = outline[None] - poses.centre[:, None]
     row, col = camera.project(np.einsum("fij,fpi->fpj", poses.dcm, line_of_sight))
     margin = 0.25 * max(camera.rows, camera.cols)

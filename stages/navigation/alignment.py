@@ -1,8 +1,10 @@
 """Initial position, velocity and attitude, with sigmas.
 
-`given`         the campaign's own `initial` attitude
-`in_motion`     levelling by GNSS acceleration, heading by GNSS course
-`from_rest`     levelling at standstill, heading by the course once the vehicle moves, carried back by the gyros
+Functions
+---------
+starting_at     a known attitude, position and velocity from the nearest fix
+align           self-alignment: in motion (levelling by GNSS acceleration, heading by GNSS course) or from rest (levelling at
+                standstill, heading by the course once the vehicle moves, carried back by the gyros)
 
 References
 ----------
@@ -18,8 +20,9 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu
+from stages.navigation.mechanisation import turn
 from tsmftis.geodesy import normal_gravity, radii_of_curvature
-from tsmftis.rotation import exp_so3, rpy_to_dcm
+from tsmftis.rotation import dcm_to_quaternion, dcm_to_rpy, quaternion_to_dcm, rpy_to_dcm
 
 Array = NDArray[np.float64]
 
@@ -38,29 +41,30 @@ class Start:
     method: str
 
 
-def gnss_velocity(gnss: Gnss) -> Array:
-    """The receiver's velocity (n, 3), or differences of its positions where it gives none."""
-    if gnss.velocity is not None:
-        return gnss.velocity
+def gnss_velocity(gnss: Gnss) -> tuple[Array, Array]:
+    """The receiver's velocity NED and its sigmas (n, 3) [m/s]; differences of positions where it gives none.
+
+    A central difference over 2Δt of fixes with sigma σ has sigma σ·√2/(2Δt).
+    """
+    if gnss.velocity is not None and gnss.sigma_velocity is not None:
+        return gnss.velocity, gnss.sigma_velocity
     north, east = radii_of_curvature(gnss.latitude)
     rate = np.stack([np.gradient(v, gnss.time) for v in (gnss.latitude, gnss.longitude, gnss.height)], 1)
-    return rate * np.stack(
-        [north + gnss.height, (east + gnss.height) * np.cos(gnss.latitude), -np.ones(gnss.time.size)], 1
-    )
+    scale = np.stack([north + gnss.height, (east + gnss.height) * np.cos(gnss.latitude), -np.ones(gnss.time.size)], 1)
+    return rate * scale, gnss.sigma_position / np.sqrt(2.0) / np.gradient(gnss.time)[:, None]
 
 
-def kinematics(time: float, gnss: Gnss, dcm: Array, lever: Array) -> tuple[Array, Array, Array, Array]:
+def starting_at(time: float, rpy: Array, sigma_rpy: Array, gnss: Gnss, lever: Array, method: str) -> Start:
     """Position and velocity of the IMU at `time` from the nearest fix, with sigmas that grow with the time to it.
 
     An aircraft accelerates by up to some 5 m/s²: σ_v² = σ_fix² + (5·Δt)², σ_r² = σ_fix² + (2.5·Δt²)², at least 0.1 m and
     0.1 m/s because the lever arm stands on the initial attitude.
     """
-    velocity = gnss_velocity(gnss)
+    velocity, sigma_velocity = gnss_velocity(gnss)
     i = int(np.argmin(np.abs(gnss.time - time)))
     dt = time - gnss.time[i]
-    v = velocity[i]
     north, east = radii_of_curvature(gnss.latitude[i])
-    offset = v * dt - dcm @ lever
+    offset = velocity[i] * dt - rpy_to_dcm(*rpy) @ lever
     position = np.array(
         [
             gnss.latitude[i] + offset[0] / (north + gnss.height[i]),
@@ -68,19 +72,9 @@ def kinematics(time: float, gnss: Gnss, dcm: Array, lever: Array) -> tuple[Array
             gnss.height[i] - offset[2],
         ]
     )
-    sigma_v = gnss.sigma_velocity[i] if gnss.sigma_velocity is not None else np.full(3, 1.0)
-    return (
-        position,
-        v,
-        np.sqrt(gnss.sigma_position[i] ** 2 + (2.5 * dt * dt) ** 2 + 0.1**2),
-        np.sqrt(sigma_v**2 + (5.0 * dt) ** 2 + 0.1**2),
-    )
-
-
-def given(time: float, rpy: Array, sigma_rpy: Array, gnss: Gnss, lever: Array) -> Start:
-    """Attitude as the campaign states it, position and velocity from the nearest fix."""
-    position, velocity, sigma_r, sigma_v = kinematics(time, gnss, rpy_to_dcm(*rpy), lever)
-    return Start(time, position, velocity, rpy, sigma_r, sigma_v, sigma_rpy, "given")
+    sigma_position = np.sqrt(gnss.sigma_position[i] ** 2 + (2.5 * dt * dt) ** 2 + 0.1**2)
+    sigma = np.sqrt(sigma_velocity[i] ** 2 + (5.0 * dt) ** 2 + 0.1**2)
+    return Start(time, position, velocity[i], rpy, sigma_position, sigma, sigma_rpy, method)
 
 
 def level(force_body: Array, force_ned: Array, yaw: float) -> tuple[float, float]:
@@ -102,14 +96,14 @@ def align(imu: Imu, gnss: Gnss, lever: Array, course_speed: float) -> Start:
     """Self-alignment: in motion where the first fixes move faster than `course_speed` [m/s], else from rest.
 
     The heading is the GNSS course (no crab angle: sigma 10° in motion, 20° from rest); the flight's own accelerations
-    refine it, and the filter is run again from the smoothed start. Raises InputError where the unit never moves fast
-    enough for a course.
+    refine it, and the filter is run again from the smoothed start. A speed counts only beyond five of its sigmas, so that the
+    scatter of a parked receiver is no course. Raises InputError where the unit never moves fast enough for a course.
     """
-    velocity = gnss_velocity(gnss)
+    velocity, sigma = gnss_velocity(gnss)
     start = max(float(imu.time[0]), float(gnss.time[0]) - 1.0)
     inside = (gnss.time >= start) & (gnss.time <= imu.time[-1])
-    speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    moving = np.flatnonzero(inside & (speed > course_speed))
+    speed, doubt = np.hypot(velocity[:, 0], velocity[:, 1]), 5.0 * np.hypot(sigma[:, 0], sigma[:, 1])
+    moving = np.flatnonzero(inside & (speed > np.maximum(course_speed, doubt)))
     if moving.size == 0:
         raise InputError(
             "gnss",
@@ -117,15 +111,21 @@ def align(imu: Imu, gnss: Gnss, lever: Array, course_speed: float) -> Start:
             f"never exceeds {course_speed:g} m/s, so no heading can be taken from the course",
             "give flights[].initial in campaign.yaml or lower navigation.course_speed_m_per_s",
         )
-    first = int(moving[0])
-    if gnss.time[first] - start < 2.0:
-        return _in_motion(imu, gnss, velocity, first, lever)
+    if gnss.time[moving[0]] - start < 2.0:
+        return _in_motion(imu, gnss, velocity, int(moving[0]), lever)
     return _from_rest(imu, gnss, velocity, moving, start, lever)
 
 
-def _mean_force(imu: Imu, start: float, stop: float) -> Array:
+def _mean_over(imu: Imu, values: Array, start: float, stop: float) -> Array:
     inside = (imu.time > start) & (imu.time <= stop)
-    return imu.accel[inside].mean(axis=0)
+    if not inside.any():
+        raise InputError(
+            "imu",
+            "variable 'time'",
+            f"has no sample between {start:.1f} and {stop:.1f} s, where the alignment needs them",
+            "give flights[].initial in campaign.yaml",
+        )
+    return np.asarray(values[inside].mean(axis=0))
 
 
 def _in_motion(imu: Imu, gnss: Gnss, velocity: Array, first: int, lever: Array) -> Start:
@@ -135,48 +135,24 @@ def _in_motion(imu: Imu, gnss: Gnss, velocity: Array, first: int, lever: Array) 
     acceleration = (velocity[last] - velocity[first]) / max(gnss.time[last] - gnss.time[first], 1e-3)
     gravity = float(normal_gravity(gnss.latitude[first], gnss.height[first]))
     force = acceleration - np.array([0.0, 0.0, gravity])
-    roll, pitch = level(_mean_force(imu, time, time + 1.0), force, yaw)
-    rpy = np.array([roll, pitch, yaw])
-    position, v, sigma_r, sigma_v = kinematics(time, gnss, rpy_to_dcm(*rpy), lever)
-    return Start(
-        time,
-        position,
-        v,
-        rpy,
-        sigma_r,
-        sigma_v,
-        np.deg2rad([3.0, 3.0, 10.0]),
-        "in motion: GNSS course and acceleration",
-    )
+    roll, pitch = level(_mean_over(imu, imu.accel, time, time + 1.0), force, yaw)
+    method = "in motion: GNSS course and acceleration"
+    return starting_at(time, np.array([roll, pitch, yaw]), np.deg2rad([3.0, 3.0, 10.0]), gnss, lever, method)
 
 
 def _from_rest(imu: Imu, gnss: Gnss, velocity: Array, moving: NDArray[np.int64], start: float, lever: Array) -> Start:
     rest = min(5.0, gnss.time[moving[0]] - start - 1.0)
-    force = _mean_force(imu, start, start + rest)
+    force = _mean_over(imu, imu.accel, start, start + rest)
     roll, pitch = level(force, np.array([0.0, 0.0, -np.linalg.norm(force)]), 0.0)
-    inside = (imu.time > start) & (imu.time <= start + rest)
-    rate_bias = imu.gyro[inside].mean(axis=0)
+    drift = _mean_over(imu, imu.gyro, start, start + rest)
     # Turn of the body from the start to each of the first moving fixes, by the gyros alone.
-    first = moving[:10]
-    levelled = rpy_to_dcm(roll, pitch, 0.0)
-    headings = []
-    for fix in first:
-        span = (imu.time > start) & (imu.time <= gnss.time[fix])
-        dcm = levelled
-        for step in exp_so3((imu.gyro[span] - rate_bias) * np.diff(imu.time, prepend=imu.time[0])[span, None]):
-            dcm = dcm @ step
-        forward = np.arctan2(dcm[1, 0], dcm[0, 0])
-        headings.append(np.exp(1j * (np.arctan2(velocity[fix, 1], velocity[fix, 0]) - forward)))
-    yaw = float(np.angle(np.mean(headings)))
-    rpy = np.array([roll, pitch, yaw])
-    position, v, sigma_r, sigma_v = kinematics(start, gnss, rpy_to_dcm(*rpy), lever)
-    return Start(
-        start,
-        position,
-        v,
-        rpy,
-        sigma_r,
-        sigma_v,
-        np.deg2rad([2.0, 2.0, 20.0]),
-        "from rest: levelling, then GNSS course",
-    )
+    fixes = moving[:10]
+    span = (imu.time > start) & (imu.time <= gnss.time[fixes[-1]])
+    steps = np.diff(imu.time, prepend=imu.time[0])[span, None]
+    turned = turn(dcm_to_quaternion(rpy_to_dcm(roll, pitch, 0.0)), (imu.gyro[span] - drift) * steps)
+    at = np.searchsorted(imu.time[span], gnss.time[fixes], side="right") - 1
+    _, _, heading = dcm_to_rpy(quaternion_to_dcm(turned[at]))
+    course = np.arctan2(velocity[fixes, 1], velocity[fixes, 0])
+    yaw = float(np.angle(np.mean(np.exp(1j * (course - heading)))))
+    method = "from rest: levelling, then GNSS course"
+    return starting_at(start, np.array([roll, pitch, yaw]), np.deg2rad([2.0, 2.0, 20.0]), gnss, lever, method)

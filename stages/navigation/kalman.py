@@ -302,6 +302,7 @@ def forward(
                         for i in range(m):
                             S[i, i] += (inflate - 1.0) * fix_variance[fix, i]
                         S_inv = np.linalg.inv(S)
+                        nis[fix] = y[:m] @ (S_inv @ y[:m])
                         accept = True
                     used[fix] = accept
                     if accept:

@@ -72,6 +72,18 @@ def _from_vector(v: Any, out: Any) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
+def turn(q: Any, theta: Any) -> Any:
+    """Attitudes (n, 4) after each of the body's rotation vectors theta (n, 3) [rad], from q, in a fixed frame."""
+    out = np.empty((theta.shape[0], 4))
+    step_q, now = np.empty(4), q.copy()
+    for i in range(theta.shape[0]):
+        _from_vector(theta[i], step_q)
+        _multiply(now, step_q, out[i])
+        now = out[i]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
 def rotate_ned(q: Any, phi: Any) -> None:
     """q ← exp(φ)·q with φ [rad] resolved in NED, in place, renormalised."""
     left = np.empty(4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.stats import chi2
 from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu, ThermalCorrection
 from stages.navigation import kalman
-from stages.navigation.alignment import Start, align, given
+from stages.navigation.alignment import Start, align, starting_at
 from stages.navigation.output import NavigationResult, assemble
 from tsmftis.camera import Mounting
 from tsmftis.geodesy import radii_of_curvature
@@ -69,15 +70,15 @@ def run(
         )
     start = _start(imu, gnss, lever, settings, initial)
     used_imu = _from(imu, start.time)
-    bias = np.zeros(12)
     for number in range(settings.passes):
-        solution = _filter_and_smooth(used_imu, gnss, model, lever, settings, start, bias)
+        solution = _filter_and_smooth(used_imu, gnss, model, lever, settings, start)
         shift = solution["correction"][0]
         if np.linalg.norm(shift[kalman.ATTITUDE]) < np.deg2rad(0.5) or number == settings.passes - 1:
             break
         # The first attitude was poor, so the filter linearised about a poor path: start again from the smoothed one. The
-        # prior is kept as wide as it was; beside the flight's own information it counts for nothing.
-        start, bias = _shifted(start, bias, shift)
+        # prior of position, velocity and attitude moves with it and keeps its width, which is nothing beside the flight's own
+        # information; that of the sensors' errors stays where it was, since it does count.
+        start = _shifted(start, shift)
     return assemble(used_imu, gnss, solution, start, number + 1)
 
 
@@ -104,7 +105,7 @@ def _start(
             f"{time:g} s lies outside the IMU's {imu.time[0]:.2f} to {imu.time[-1]:.2f} s",
             "give a time inside the flight, or leave `initial` out",
         )
-    return given(max(time, float(imu.time[0])), rpy, sigma, gnss, lever)
+    return starting_at(max(time, float(imu.time[0])), rpy, sigma, gnss, lever, "given")
 
 
 def _from(imu: Imu, time: float) -> Imu:
@@ -117,27 +118,16 @@ def _from(imu: Imu, time: float) -> Imu:
     )
 
 
-def _shifted(start: Start, bias: Array, shift: Array) -> tuple[Start, Array]:
+def _shifted(start: Start, shift: Array) -> Start:
+    """The start moved by a smoothed correction of its position, velocity and attitude."""
     north, east = radii_of_curvature(start.position[0])
-    position = start.position + shift[:3] / np.array(
-        [
-            north + start.position[2],
-            (east + start.position[2]) * np.cos(start.position[0]),
-            -1.0,
-        ]
+    scale = np.array([north + start.position[2], (east + start.position[2]) * np.cos(start.position[0]), -1.0])
+    return replace(
+        start,
+        position=start.position + shift[kalman.POSITION] / scale,
+        velocity=start.velocity + shift[kalman.VELOCITY],
+        rpy=np.array(dcm_to_rpy(exp_so3(shift[kalman.ATTITUDE]) @ rpy_to_dcm(*start.rpy))),
     )
-    rpy = np.array(dcm_to_rpy(exp_so3(shift[kalman.ATTITUDE]) @ rpy_to_dcm(*start.rpy)))
-    moved = Start(
-        start.time,
-        position,
-        start.velocity + shift[kalman.VELOCITY],
-        rpy,
-        start.sigma_position,
-        start.sigma_velocity,
-        start.sigma_rpy,
-        start.method,
-    )
-    return moved, bias + shift[9:]
 
 
 def _initial_covariance(start: Start, model: ImuModel) -> Array:
@@ -165,7 +155,7 @@ def _process_noise(model: ImuModel) -> Array:
 
 
 def _filter_and_smooth(
-    imu: Imu, gnss: Gnss, model: ImuModel, lever: Array, settings: NavigationSettings, start: Start, bias: Array
+    imu: Imu, gnss: Gnss, model: ImuModel, lever: Array, settings: NavigationSettings, start: Start
 ) -> dict[str, Any]:
     n, nfix = imu.time.size, gnss.time.size
     steps = np.diff(imu.time, prepend=imu.time[0])
@@ -225,7 +215,7 @@ def _filter_and_smooth(
         start.position.copy(),
         start.velocity.copy(),
         dcm_to_quaternion(rpy_to_dcm(*start.rpy)),
-        bias.copy(),
+        np.zeros(12),
         _initial_covariance(start, model),
         _process_noise(model),
         gap_noise,

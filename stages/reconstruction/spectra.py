@@ -84,7 +84,8 @@ def run(
     )
     value, sigma = fourier.radiance(ac, opd, window, wavenumber, phi, response, variance * ifg.gain)
     value[~counted], sigma[~counted] = np.nan, np.nan
-    area, sigma_area = _area(ifg, tracks, ac, variance, counted, opd, window, wavenumber, phi, response, camera)
+    breaks = [start for start, _ in frames.segments()[1:]]
+    area, sigma_area = _area(ifg, tracks, breaks, value, variance, opd, window, wavenumber, phi, response)
     centre = Tracks.CENTRE
     spectra = Spectra(
         tracks.methods,
@@ -96,9 +97,9 @@ def run(
         sigma_area,
         scored_references(targets, references, calibration, interferometer, wavenumber),
         counted.sum(axis=2),
+        phase,
         {
             "apodization": APODIZATION,
-            "phase_coefficients": " ".join(f"{c:.9g}" for c in phase),
             "phase_method": "Mertz, one polynomial for the line",
             "drift_order": settings.drift_order,
             "read_variance_dn2": read_variance,
@@ -116,13 +117,17 @@ def extract(
     interferometer: Interferometer,
     settings: ReconstructionSettings,
 ) -> Interferograms:
-    """Interferograms of all points (method, target, point, col), frames read in blocks that overlap by one."""
+    """Interferograms of all points (method, target, point, col), frames read in blocks that overlap by one within a run."""
     shape = tracks.row.shape[:3]
     row, col = (np.ascontiguousarray(a.reshape(-1, a.shape[-1])) for a in (tracks.row, tracks.col))
     value, gain, weight, mean_row = (np.zeros((row.shape[0], camera.cols)) for _ in range(4))
-    count = frames.time.size
-    for first in range(0, count - 1, settings.block_frames):
-        counts = frames.block(first, min(first + settings.block_frames + 1, count))
+    blocks = [
+        (first, min(first + settings.block_frames + 1, stop))
+        for start, stop in frames.segments()
+        for first in range(start, stop - 1, settings.block_frames)
+    ]
+    for first, last in blocks:
+        counts = frames.block(first, last)
         block = detector.correct(
             counts, calibration.dark, calibration.flat, camera.saturation, interferometer.detector_nonlinearity
         )
@@ -186,36 +191,29 @@ def _of(opd: Array, leading: int, counted: NDArray[np.bool_]) -> Array:
 def _area(
     ifg: Interferograms,
     tracks: Tracks,
-    ac: Array,
+    breaks: list[int],
+    value: Array,
     variance: Array,
-    counted: NDArray[np.bool_],
     opd: Array,
     window: Array,
     wavenumber: Array,
     phi: Array,
     response: Array,
-    camera: Camera,
 ) -> tuple[Array, Array]:
-    """Mean spectrum of each area and its sigma: transform is linear, so the mean interferogram is transformed where all
-    points share their OPDs, with the noise of shared pixels counted once."""
-    methods, targets = ac.shape[:2]
-    area = np.full((methods, targets, wavenumber.size), np.nan)
-    sigma = np.full_like(area, np.nan)
-    for m in range(methods):
-        for t in range(targets):
-            chosen = counted[m, t]
-            if chosen.sum() < LEAST_POINTS:
-                continue
-            gain = np.zeros(camera.cols)
-            extraction.shared_gain(tracks.row[m, t], tracks.col[m, t], chosen, ifg.crossings[m, t], camera.rows, gain)
-            at, w = (opd, window) if opd.ndim == 1 else (opd[m, t, chosen], window[m, t, chosen])
-            one, _ = fourier.radiance(ac[m, t, chosen], at, w, wavenumber, phi, response)
-            area[m, t] = one.mean(axis=0)
-            mean_at, mean_w = (at, w) if opd.ndim == 1 else (at.mean(axis=0), w.mean(axis=0))
-            mean_variance = variance[m, t, chosen].mean(axis=0) * gain
-            _, sigma[m, t] = fourier.radiance(
-                ac[m, t, chosen].mean(axis=0), mean_at, mean_w, wavenumber, phi, response, mean_variance
-            )
+    """Mean spectrum of each area's counted points (those whose `value` is finite) and its sigma, in which the noise of pixels
+    that several points share is counted once. breaks: frames before which frames are missing."""
+    counted = np.isfinite(value[..., 0])
+    area, sigma = np.full_like(value[:, :, 0], np.nan), np.full_like(value[:, :, 0], np.nan)
+    rows = int(np.nanmax(tracks.row, initial=0.0)) + 2
+    for m, t in zip(*np.nonzero(counted.sum(axis=2) >= LEAST_POINTS), strict=True):
+        chosen = counted[m, t]
+        area[m, t] = value[m, t, chosen].mean(axis=0)
+        gain = np.zeros(ifg.value.shape[-1])
+        row, col = (np.insert(track[m, t], breaks, np.nan, axis=1) for track in (tracks.row, tracks.col))
+        extraction.shared_gain(row, col, chosen, ifg.crossings[m, t], rows, gain)
+        at, w = (opd, window) if opd.ndim == 1 else (opd[m, t, chosen].mean(axis=0), window[m, t, chosen].mean(axis=0))
+        mean_variance = variance[m, t, chosen].mean(axis=0) * gain
+        _, sigma[m, t] = fourier.radiance(mean_variance, at, w, wavenumber, phi, response, mean_variance)
     return area, sigma
 
 

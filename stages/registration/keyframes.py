@@ -56,7 +56,7 @@ def run(frames: Frames, anchored: Tracks, camera: Camera, settings: Registration
     motion, lost, keys = image_motion(frames, settings)
     row, col = np.full_like(anchored.row, np.nan), np.full_like(anchored.col, np.nan)
     for target, frame in enumerate(anchor):
-        start = np.linalg.pinv(motion[frame]) if np.isfinite(motion[frame]).all() else np.full((3, 3), np.nan)
+        start = np.linalg.inv(motion[frame])
         here = np.stack(
             [anchored.col[0, target, :, frame], anchored.row[0, target, :, frame], np.ones(anchored.row.shape[2])]
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,13 +37,3 @@ def run(spectra: Spectra) -> ScoringResult:
             if missed:
                 partly[method] = sorted(set(partly.get(method, [])) | set(missed))
     return ScoringResult(scores, partly)
-
-
-def campaign_means(lines: Iterable[Mapping[str, Mapping[str, Mapping[str, Any]]]]) -> dict[str, dict[str, float]]:
-    """Means over all targets of all lines, {kind: {method: mean}}, from the lines' `scores`."""
-    pooled: dict[str, dict[str, list[float]]] = {kind: {} for kind in KINDS}
-    for scores in lines:
-        for kind in KINDS:
-            for method, entry in scores.get(kind, {}).items():
-                pooled[kind].setdefault(method, []).extend(entry["targets"].values())
-    return {kind: {m: float(np.mean(v)) for m, v in methods.items() if v} for kind, methods in pooled.items()}

@@ -35,7 +35,7 @@ class ThermalSettings(BaseModel):
     """Most steps of that search."""
     verification_block_s: Positive = 100.0
     """The verification figures are standard deviations of means over this time."""
-    minimum_span_k: Positive = 2.0
+    minimum_span_k: float = Field(default=2.0, ge=0.5)
     """A chamber run in which a channel's temperature moves less teaches it nothing."""
     polynomial_degrees: tuple[Count, ...] = Field(default=(1, 2, 3, 4, 5), min_length=1)
     """Degrees among which cross-validation chooses for the polynomial in T."""

@@ -13,12 +13,9 @@ from stages.thermal.features import STEPS_PER_TIME_CONSTANT
 from stages.thermal.model import METHODS, ThermalModel
 from stages.thermal.network import BayesianRbf
 from stages.thermal.targets import bias_samples, block_means, refuse_motion, thinned
-from tsmftis.geodesy import STANDARD_GRAVITY
+from tsmftis.inertial import DEG_PER_H, MICRO_G
 
 Array = NDArray[np.float64]
-
-DEG_PER_H = float(np.rad2deg(3600.0))  # of 1 rad/s
-MICRO_G = 1e6 / STANDARD_GRAVITY  # of 1 m/s²
 
 
 def verify_run(model: ThermalModel, chamber: Chamber, seconds: float) -> dict[str, Any]:
@@ -66,6 +63,6 @@ def verification_table(runs: Sequence[dict[str, Any]]) -> dict[str, dict[str, li
     for method in ("raw", *METHODS):
         left = np.vstack([run["raw"] if method == "raw" else run["left"][method] for run in runs])
         deviation = left.std(axis=0)
-        table["gyro_std_deg_per_h"][method] = (deviation[:3] * DEG_PER_H).tolist()
-        table["accel_std_ug"][method] = (deviation[3:] * MICRO_G).tolist()
+        table["gyro_std_deg_per_h"][method] = (deviation[:3] / DEG_PER_H).tolist()
+        table["accel_std_ug"][method] = (deviation[3:] / MICRO_G).tolist()
     return table

@@ -117,7 +117,8 @@ def test_spectra(tmp_path: Path, data: st.DataObject, methods: int, targets: int
         *(data.draw(numbers(shape, nan=True)) for _ in Spectra.SPECTRA),
         reference=data.draw(numbers(shape[1:], nan=True)),
         points=data.draw(arrays(np.int64, shape[:2], elements=st.integers(0, 25))),
-        attributes={"apodization": "connes", "phase_coefficients": "0.1 0.2"},
+        phase=np.array([0.1, 0.2]),
+        attributes={"apodization": "connes"},
     )
     assert_same(spectra, there_and_back(spectra, tmp_path))
 

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from pipeline.errors import StageError
 from pipeline.raster import open_cube, utm_crs
 from pipeline.records import Calibration, CameraPoses, Frames, Targets, Tracks
-from stages.mapping import MapGrid, MappingSettings, line_grid, run
+from stages.mapping import MappingSettings, line_grid, run
+from stages.mapping.cube import MapGrid
 from stages.reconstruction import ReconstructionSettings
 from stages.reconstruction import run as reconstruct
 from stages.tracking.collinearity import project, target_points
@@ -69,10 +70,10 @@ def flat(latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
     return np.full(np.shape(latitude), GROUND)
 
 
-def cube(tilt: float, grid: MapGrid, wavenumber: np.ndarray, phase: np.ndarray, strip: int = 128) -> np.ndarray:
+def cube(tilt: float, grid: MapGrid, wavenumber: np.ndarray, phase: np.ndarray) -> np.ndarray:
     out = np.full((*grid.shape, wavenumber.size), -1.0, np.float32)
     raw, calibration = frames(tilt)
-    settings = MappingSettings(strip_cells=strip)
+    settings = MappingSettings()
     for start, part in run(
         raw, poses(), flat, grid, wavenumber, phase, calibration, CAMERA, interferometer(tilt), settings
     ):
@@ -102,12 +103,14 @@ def test_a_cell_is_a_target_at_its_centre(tilt: float) -> None:
         np.testing.assert_allclose(mapped[cell], want, rtol=2e-5, atol=2e-5)
 
 
-def test_strips_do_not_matter() -> None:
-    """8 cells at a time or all: the same frames are chosen for every cell that is seen (bit for bit)."""
+def test_strips_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One row of cells at a time or all: the same frames are chosen for every cell that is seen (bit for bit)."""
     grid = line_grid(poses(), CAMERA, GROUND, MappingSettings())
     sigma = interferometer(0.0).scored_wavenumbers(100_000.0)
     phase = np.full(sigma.size, 0.2)
-    np.testing.assert_array_equal(cube(0.0, grid, sigma, phase, 8), cube(0.0, grid, sigma, phase, 4096))
+    whole = cube(0.0, grid, sigma, phase)
+    monkeypatch.setattr("stages.mapping.cube.STRIP_VALUES", 1)
+    np.testing.assert_array_equal(cube(0.0, grid, sigma, phase), whole)
 
 
 def test_a_panel_lies_where_it_was_surveyed(tmp_path: Path) -> None:

@@ -356,7 +356,7 @@ def inside(seed: int) -> Inside:
     chosen = NavigationSettings()
     start = pos._start(this.imu, this.gnss, LEVER, chosen, this.initial)
     imu = pos._from(this.imu, start.time)
-    s = pos._filter_and_smooth(imu, this.gnss, MODEL, LEVER, chosen, start, np.zeros(12))
+    s = pos._filter_and_smooth(imu, this.gnss, MODEL, LEVER, chosen, start)
     result = assemble(imu, this.gnss, s, start, 1)
     # Stamps on which an epoch ends, well inside: there the estimate and the epoch's covariance belong together.
     on_epoch = np.flatnonzero(np.abs(s["epoch_time"][s["epoch"]] - imu.time) < 1e-9)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flows.results import campaign_means
 from pipeline.records import Spectra
 from stages.scoring import run
-from stages.scoring.score import campaign_means
 
 NAN = np.full(4, np.nan)
 
@@ -32,6 +32,7 @@ def spectra() -> Spectra:
         area,
         reference,
         np.full((2, 4), 25),
+        np.zeros(3),
     )
 
 
