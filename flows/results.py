@@ -56,9 +56,13 @@ def assemble(plan: Plan, records: list[StageRecord]) -> dict[str, Any]:
             for method, targets in score["partly_seen"].items():
                 partly.setdefault(method, []).extend(f"{unit}/{t}" for t in targets)
         flights[flight.id] = {"navigation": summary("navigation", flight.id), "lines": lines}
-    means = campaign_means([line for flight in flights.values() for line in flight["lines"].values()])
+    means = campaign_means(lines_of(flights))
     content: dict[str, Any] = {
         "schema": SCHEMA,
+        "targets_scored": {
+            method: sum(len(line["rqe"].get(method, {}).get("targets", {})) for line in lines_of(flights))
+            for method in means["rqe"]
+        },
         "campaign": keys.name,
         **means,
         "partly_seen": partly,
@@ -70,6 +74,11 @@ def assemble(plan: Plan, records: list[StageRecord]) -> dict[str, Any]:
     if keys.thermal and (verification := summary("thermal", "campaign")) is not None:
         content["thermal"] = verification
     return content
+
+
+def lines_of(flights: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The entries of all lines of all flights."""
+    return [line for flight in flights.values() for line in flight["lines"].values()]
 
 
 def write_run(plan: Plan, content: dict[str, Any]) -> Path:

@@ -27,6 +27,7 @@ from pipeline.records import CameraPoses, Imu, Spectra, ThermalCorrection, Track
 from pipeline.run_stage import StageRecord, run_stage, write_json
 from stages import bench as bench_stage
 from stages import mapping, navigation, reconstruction, registration, scoring, thermal, tracking
+from tsmftis import __version__
 from tsmftis.fourier import smooth_phase
 
 # Each stage and the stages whose results it reads, in the order in which a reader should meet them.
@@ -130,6 +131,13 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         n: f"{flight}/{f}"
         for n, f in (("trajectory", "trajectory.nc"), ("sbet", "trajectory.sbet"), ("figures", "navigation.json"))
     }
+    about = {
+        "title": f"smoothed trajectory of flight {flight}",
+        "campaign": campaign.keys.name,
+        "epoch": campaign.keys.time.epoch,
+        "time_scale": campaign.keys.time.scale,
+        "source": f"tsmftis {__version__}",
+    }
     if compensated := campaign.keys.thermal is not None and _has_temperatures(campaign, flight):
         inputs["model"] = _needed(model, "thermal")
         outputs["correction"] = f"{flight}/thermal.nc"
@@ -150,7 +158,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
             )
         if correction is not None:
             write_dataset(correction.to_dataset(), to["correction"])
-        write_dataset(result.trajectory.to_dataset(), to["trajectory"])
+        write_dataset(result.trajectory.to_dataset().assign_attrs(about), to["trajectory"])
         sbet.write_sbet(sbet.from_trajectory(result.trajectory), to["sbet"])
         write_json(to["figures"], {"quality": result.quality, "figures": result.figures})
         return result.quality | {"compensated": compensated} | (_reach(correction) if correction is not None else {})
@@ -162,6 +170,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         ("stages.navigation", "stages.thermal", "pipeline.formats.sbet"),
         {
             "settings": _plain(plan.settings.navigation),
+            "about": about,
             "imu": _plain(instrument.imu),
             "initial": _plain(entry.initial),
             "antenna": _plain(instrument.mounting.imu_to_antenna if instrument.mounting else None),
@@ -279,7 +288,12 @@ def reconstruction_step(plan: Plan, flight: str, line: str) -> StageRecord:
             plan.settings.reconstruction,
         )
         write_dataset(result.spectra.to_dataset(), to["spectra"])
-        write_dataset(result.interferograms.to_dataset(), to["interferograms"])
+        columns = np.arange(instrument.interferometer.cols)
+        opd = instrument.interferometer.opd((instrument.interferometer.rows - 1) / 2, columns)
+        interferograms = result.interferograms.to_dataset().assign_coords(
+            opd=(("col",), opd, {"units": "m", "long_name": "optical path difference in the middle row"})
+        )
+        write_dataset(interferograms, to["interferograms"])
         return {"phase": result.phase.tolist(), "read_variance_dn2": result.read_variance, "gain_dn": result.gain}
 
     return run_stage(

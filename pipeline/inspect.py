@@ -314,6 +314,18 @@ def _describe_line(
     targets = found.attempt(campaign.targets, flight, line)
     if targets is not None:
         found.add(part, targets=f"{len(targets.ids)} ({sum(map(bool, targets.reference))} with reference)")
+        camera = campaign.instrument.camera
+        if gnss is not None and frames is not None and camera is not None:
+            height = float(np.interp(frames.time, gnss.time, gnss.height).mean() - targets.height.mean())
+            sample = camera.ground_sample(height)
+            found.add(
+                part,
+                ground_sample=f"{sample:.3g} m from {height:.0f} m above the targets, swath {sample * camera.rows:.3g} m",
+            )
+            if not 1.0 < targets.size.mean() / sample < 1e4:
+                found.warnings.append(
+                    f"{part}: targets of {targets.size.mean():.3g} m are seen with samples of {sample:.3g} m"
+                )
         if gnss is not None:
             away = np.rad2deg(
                 np.hypot(

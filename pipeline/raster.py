@@ -128,6 +128,7 @@ def open_cube(
     )
     for band, wavelength in enumerate(wavelengths_nm, start=1):
         target.set_band_description(band, f"{wavelength:.3f} nm")
+        target.update_tags(band, wavelength=f"{wavelength:.6f}", wavelength_units="nm")
     target.update_tags(wavelength_units="nm", quantity="spectral radiance, reference radiance unit")
     return target
 

@@ -730,11 +730,26 @@ class ThermalCorrection:
         dims = ("time", "axis")
         return xr.Dataset(
             {
-                "gyro": (dims, self.gyro, {"units": "rad s-1"}),
-                "accel": (dims, self.accel, {"units": "m s-2"}),
+                "gyro": (
+                    dims,
+                    self.gyro,
+                    {"units": "rad s-1", "long_name": "bias, to be subtracted, in the IMU's axes"},
+                ),
+                "accel": (
+                    dims,
+                    self.accel,
+                    {"units": "m s-2", "long_name": "bias, to be subtracted, in the IMU's axes"},
+                ),
                 "sigma_gyro": (dims, self.sigma_gyro, {"units": "rad s-1"}),
                 "sigma_accel": (dims, self.sigma_accel, {"units": "m s-2"}),
-                "distance": (("time", "channel"), self.distance, {"units": "1"}),
+                "distance": (
+                    ("time", "channel"),
+                    self.distance,
+                    {
+                        "units": "1",
+                        "long_name": "how far outside the chamber's conditions, in their standard deviations",
+                    },
+                ),
             },
             {"time": (("time",), self.time, {"units": "s"}), "axis": ["x", "y", "z"]},
         )

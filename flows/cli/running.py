@@ -105,6 +105,8 @@ def run(
     # In the order that run.json has, so that report and table do not hang on what was computed and what was read back.
     content = json.loads(json.dumps(assemble(plan, records), sort_keys=True))
     write_run(plan, content)
+    ran = sum(record.status == "done" and not record.cached for record in records)
+    console.print(f"ran {ran} of {len(records)} stages; writing the report", markup=False)
     report = write_report(opened, plan.out, content, settings.model_dump(mode="json"), inspection.warnings)
     print_scores(console, content)
     console.print(f"report: {_short(report)}   ({time.perf_counter() - started:.0f} s)", markup=False)
@@ -119,14 +121,20 @@ def print_scores(console: Console, content: dict[str, Any]) -> None:
     if not content.get("rqe"):
         return
     table = Table(
-        title="RQE, mean over all targets", show_edge=False, header_style="bold", pad_edge=False, title_justify="left"
+        title="RQE (0 is perfect), mean over the targets of all lines",
+        show_edge=False,
+        header_style="bold",
+        pad_edge=False,
+        title_justify="left",
     )
     table.add_column("method")
-    for name in ("one point", "area mean"):
+    for name in ("one point", "area mean", "targets"):
         table.add_column(name, justify="right")
     for method, value in content["rqe"].items():
         area = content["rqe_area"].get(method)
-        table.add_row(method, f"{value:.4f}", "–" if area is None else f"{area:.4f}")
+        table.add_row(
+            method, f"{value:.4f}", "–" if area is None else f"{area:.4f}", str(content["targets_scored"][method])
+        )
     console.print(table)
     for method, targets in content["partly_seen"].items():
         console.print(f"not seen well enough under {method}: {', '.join(targets)}", markup=False)

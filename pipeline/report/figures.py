@@ -50,38 +50,39 @@ def thin(*series: Array) -> list[list[float]]:
 def trajectory_map(
     trajectory: Trajectory, lines: dict[str, tuple[float, float]], targets: dict[str, Targets]
 ) -> go.Figure:
-    """Plan view in metres about the flight's middle, its lines and targets."""
+    """Plan view in kilometres about the flight's middle, its lines and targets."""
     origin = (
         float(np.median(trajectory.latitude)),
         float(np.median(trajectory.longitude)),
         float(np.median(trajectory.height)),
     )
-    ned = local_metres(trajectory.latitude, trajectory.longitude, trajectory.height, *origin)
+    ned = local_metres(trajectory.latitude, trajectory.longitude, trajectory.height, *origin) / 1000.0
     figure = go.Figure()
-    north, east = thin(ned[:, 0], ned[:, 1])
-    figure.add_scatter(x=east, y=north, mode="lines", name="flight", line={"color": "#777", "width": 1.5})
+    along, right = thin(ned[:, 0], ned[:, 1])
+    figure.add_scatter(x=right, y=along, mode="lines", name="flight", line={"color": "#777", "width": 1.5})
     for name, (start, stop) in lines.items():
         inside = (trajectory.time >= start) & (trajectory.time <= stop)
         n, e = thin(ned[inside, 0], ned[inside, 1])
         figure.add_scatter(x=e, y=n, mode="lines", name=f"line {name}", line={"width": 5})
     for name, t in targets.items():
-        at = local_metres(t.latitude, t.longitude, t.height, *origin)
+        at = local_metres(t.latitude, t.longitude, t.height, *origin) / 1000.0
         figure.add_scatter(
             x=at[:, 1].tolist(),
             y=at[:, 0].tolist(),
             mode="markers",
             name=f"targets {name}",
             text=list(t.ids),
-            marker={"symbol": "square", "size": 7, "color": "#111"},
+            marker={"symbol": "square-open", "size": 5, "color": "#111"},
         )
-    figure.update_xaxes(title="east [m]")
-    figure.update_yaxes(title="north [m]", scaleanchor="x", scaleratio=1)
+    north, east = np.rad2deg(origin[0]), np.rad2deg(origin[1])
+    figure.update_xaxes(title=f"east [km] of {north:.5f}°, {east:.5f}°")
+    figure.update_yaxes(title="north [km]", scaleanchor="x", scaleratio=1)
     return layout(figure, 520)
 
 
 def attitude(trajectory: Trajectory, lines: dict[str, tuple[float, float]]) -> go.Figure:
     """Height, ground speed, roll, pitch and heading over time, the lines shaded."""
-    names = ("height [m]", "ground speed [m/s]", "roll [°]", "pitch [°]", "heading [°]")
+    names = ("height [m]", "ground speed [m/s]", "roll [°]", "pitch [°]", "heading [°], unwrapped")
     speed = np.hypot(trajectory.velocity[:, 0], trajectory.velocity[:, 1])
     rpy = np.rad2deg(trajectory.rpy)
     heading = np.rad2deg(np.unwrap(trajectory.rpy[:, 2]))
@@ -142,8 +143,9 @@ def navigation_quality(
 
 
 def _shade(figure: go.Figure, lines: dict[str, tuple[float, float]]) -> None:
-    for start, stop in lines.values():
+    for name, (start, stop) in lines.items():
         figure.add_vrect(x0=start, x1=stop, fillcolor="#ffd54d", opacity=0.35, line_width=0)
+        figure.add_annotation(x=0.5 * (start + stop), y=1.0, yref="paper", yanchor="bottom", text=name, showarrow=False)
 
 
 def thermal(runs: list[dict[str, Any]], sensor: str) -> go.Figure:
@@ -256,13 +258,17 @@ def tracks_over_frame(frames: Frames, tracks: Tracks) -> go.Figure:
     return layout(figure, 560)
 
 
-def spectra(record: Spectra, area: bool) -> go.Figure:
+def spectra(record: Spectra, references: tuple[str, ...], area: bool) -> go.Figure:
     """Each target's spectrum under each method with its 95 % band, against the reference at the same line shape."""
     names = record.targets
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
     figure = make_subplots(
-        rows=rows, cols=columns, subplot_titles=list(names), vertical_spacing=0.28 / rows, horizontal_spacing=0.06
+        rows=rows,
+        cols=columns,
+        subplot_titles=[f"{n} ({r})" if r else n for n, r in zip(names, references, strict=True)],
+        vertical_spacing=0.28 / rows,
+        horizontal_spacing=0.06,
     )
     value = record.radiance_area if area else record.radiance
     sigma = record.sigma_radiance_area if area else record.sigma_radiance
@@ -300,12 +306,18 @@ def spectra(record: Spectra, area: bool) -> go.Figure:
                 y=y.tolist(),
                 name=method,
                 legendgroup=method,
-                showlegend=t == 0,
+                showlegend=False,
                 line=_stroke(method, 1.4),
                 **at,
             )
-        figure.update_xaxes(title="wavelength [nm]" if t // columns == rows - 1 else None, **at)
+        figure.update_xaxes(title="wavelength [nm]" if t + columns >= len(names) else None, **at)
         figure.update_yaxes(title="radiance [ref. unit]" if t % columns == 0 else None, **at)
+    # The first target need not have every method: the legend is given its own traces.
+    for method in record.methods:
+        if method != "nominal":
+            figure.add_scatter(
+                x=[None], y=[None], mode="lines", name=method, legendgroup=method, line=_stroke(method, 1.4)
+            )
     layout(figure, 90 + 260 * rows)
     figure.update_layout(legend={"y": 1.0 + 0.18 / rows}, margin={"t": 80})
     return figure

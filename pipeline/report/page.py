@@ -128,8 +128,9 @@ def _line(
     if (folder / "spectra.nc").exists():
         spectra = Spectra.from_file(folder / "spectra.nc")
         record = Interferograms.from_file(folder / "interferograms.nc")
-        entry["figures"]["area"] = draw.html(figures.spectra(spectra, area=True))
-        entry["figures"]["point"] = draw.html(figures.spectra(spectra, area=False))
+        names = campaign.targets(flight, line).reference
+        entry["figures"]["area"] = draw.html(figures.spectra(spectra, names, area=True))
+        entry["figures"]["point"] = draw.html(figures.spectra(spectra, names, area=False))
         interferometer = campaign.instrument.interferometer
         assert interferometer is not None
         opd = interferometer.opd((interferometer.rows - 1) / 2, np.arange(interferometer.cols))

@@ -52,11 +52,17 @@ class BenchSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     apodization: str | None = None
+    """Default: what the file states, else Blackman–Harris 3; one of those of tsmftis.fourier.APODIZATIONS."""
     phase_correction: PhaseCorrection | None = None
+    """Default: what the file states, else mertz; mertz or power."""
     zero_filling: int | None = Field(None, ge=1, le=64)
+    """Factor of the zero filling, which sets the spacing of the wavenumbers; default: what the file states, else 2."""
     resolution_per_m: float | None = Field(None, gt=0)
+    """Default: what the file states, else all that the scan holds."""
     phase_resolution_per_m: float | None = Field(None, gt=0)
-    normalisation_per_m: float = Field(OPUS_UNIT, gt=0, description="c; 1 for a density in counts per m-1")
+    """Resolution of the phase's low-resolution spectrum; default: what the file states."""
+    normalisation_per_m: float = Field(OPUS_UNIT, gt=0)
+    """Width that the spectrum's density is multiplied by: the default gives OPUS's unit, 1 gives counts per m-1."""
 
     @field_validator("apodization")
     @classmethod

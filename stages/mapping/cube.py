@@ -26,7 +26,7 @@ Heights = Callable[[Array, Array], Array]
 
 LEAST_SEEN = 0.97  # of the columns, for a cell to have a spectrum: the score's own rule
 EDGE_CELLS = 12  # kept beyond the ends of what the plane says is seen
-STRIP_VALUES = 4_000_000  # cells × columns worked off at a time
+STRIP_VALUES = 1_500_000  # cells × columns worked off at a time
 BLOCK_FRAMES = 256  # frames in memory at a time
 MOST_CELLS = 200_000_000  # a grid larger than this means poses that are wrong
 

@@ -38,7 +38,7 @@ class NavigationSettings(BaseModel):
     course_speed_m_per_s: float = Field(
         1.0, gt=0, description="least speed whose course is taken for the heading when the pipeline aligns itself"
     )
-    use_gnss_velocity: bool = True
+    use_gnss_velocity: bool = Field(True, description="use the fixes' velocities besides their positions")
     passes: int = Field(3, ge=1, le=6, description="most filter passes when the first attitude was poor")
 
 

@@ -34,10 +34,10 @@ class RegistrationSettings(BaseModel):
 
     corners: int = Field(400, ge=20, description="most corners followed from a key frame")
     corner_quality: float = Field(0.01, gt=0, lt=1, description="least corner response over the best one")
-    corner_distance_px: float = Field(4.0, gt=0)
+    corner_distance_px: float = Field(4.0, gt=0, description="least distance between corners")
     window_px: int = Field(15, ge=5, le=63, description="side of the KLT window")
-    pyramid_levels: int = Field(3, ge=0, le=6)
-    ransac_threshold_px: float = Field(0.7, gt=0)
+    pyramid_levels: int = Field(3, ge=0, le=6, description="halvings of the image for large motions")
+    ransac_threshold_px: float = Field(0.7, gt=0, description="a corner farther from the common motion is left out")
     least_inliers: int = Field(12, ge=4, description="fewer inliers than this start a new key frame")
     kept_fraction: float = Field(
         0.5, gt=0, lt=1, description="a new key frame when fewer of the corners are still followed"
