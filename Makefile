@@ -10,7 +10,7 @@ demo: .venv/installed
 	$(BIN)/tsmftis run out/demo --out out/demo-run
 
 test: .venv/installed
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2
 
 lint: .venv/installed
 	$(BIN)/ruff check .

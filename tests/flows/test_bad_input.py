@@ -155,8 +155,8 @@ CAMPAIGNS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "flights is a text": (keys("flights", to="F1"), ("campaign.yaml", "flights")),
     "no lines without calibration": (keys("calibration", drop=True), ("campaign.yaml", "calibration", "missing")),
     "two lines of one id": (keys("flights", 0, "lines", 1, "id", to="L01"), ("campaign.yaml", "'L01' occurs twice")),
-    "id with a slash": (keys(*LINE, "id", to="../L01"), ("campaign.yaml", "lines[].id")),
-    "id with a newline": (keys(*LINE, "id", to="L01\n"), ("campaign.yaml", "lines[].id")),
+    "id with a slash": (keys(*LINE, "id", to="../L01"), ("campaign.yaml", "lines.0.id")),
+    "id with a newline": (keys(*LINE, "id", to="L01\n"), ("campaign.yaml", "lines.0.id")),
     "id that is a folder's parent": (keys(*FLIGHT, "id", to=".."), ("campaign.yaml", "flights[].id")),
     "id that is an output": (keys(*LINE, "id", to="trajectory.nc"), ("campaign.yaml", "lines[].id")),
     "path with ..": (
