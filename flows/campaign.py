@@ -6,7 +6,9 @@ cluster whose machines share the folders.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +20,7 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.futures import PrefectFuture, as_completed
 from prefect.task_runners import ThreadPoolTaskRunner
+from threadpoolctl import threadpool_limits
 
 from flows import steps
 from flows.steps import NEEDS, Plan
@@ -29,6 +32,9 @@ LINE_STAGES = ("tracking", "registration", "reconstruction", "mapping", "scoring
 
 Listener = Callable[[StageRecord], None]
 Future = PrefectFuture[StageRecord]
+
+# Not among a flow's parameters: those travel with every task to other machines, which a terminal cannot.
+_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 
 @task(name="stage", task_run_name="{stage} {unit}", cache_policy=NO_CACHE, persist_result=False)
@@ -74,8 +80,9 @@ class _Graph:
             if self.plan.wants(flight, line.id):
                 self.line(flight, line.id)
 
-    def results(self, listener: Listener | None) -> list[StageRecord]:
-        """Records in the order of submission, failed and skipped ones among them; `listener` hears of each as it ends."""
+    def results(self) -> list[StageRecord]:
+        """Records in the order of submission, failed and skipped ones among them; the listener hears of each as it ends."""
+        listener = _listener.get()
         for future in as_completed(self.futures):
             future.wait()
             if listener and future.state.is_completed():
@@ -88,23 +95,23 @@ class _Graph:
 
 
 @flow(name="line", validate_parameters=False, persist_result=False)
-def line_flow(plan: Plan, flight: str, line: str, listener: Listener | None = None) -> list[StageRecord]:
+def line_flow(plan: Plan, flight: str, line: str) -> list[StageRecord]:
     """The stages of one line, on the flight's trajectory as it is."""
     graph = _Graph(plan)
     graph.line(flight, line)
-    return graph.results(listener)
+    return graph.results()
 
 
 @flow(name="flight", validate_parameters=False, persist_result=False)
-def flight_flow(plan: Plan, flight: str, listener: Listener | None = None) -> list[StageRecord]:
+def flight_flow(plan: Plan, flight: str) -> list[StageRecord]:
     """Navigation and the lines of one flight, on the thermal model as it is."""
     graph = _Graph(plan)
     graph.flight(flight)
-    return graph.results(listener)
+    return graph.results()
 
 
 @flow(name="campaign", validate_parameters=False, persist_result=False)
-def campaign_flow(plan: Plan, listener: Listener | None = None) -> list[StageRecord]:
+def campaign_flow(plan: Plan) -> list[StageRecord]:
     """Thermal model, flights, lines and bench interferograms of a campaign."""
     graph = _Graph(plan)
     keys = plan.opened.keys
@@ -116,28 +123,33 @@ def campaign_flow(plan: Plan, listener: Listener | None = None) -> list[StageRec
     for bench in keys.bench:
         if not plan.lines:
             graph.submit("bench", bench.id)
-    return graph.results(listener)
+    return graph.results()
 
 
 def run_campaign(plan: Plan, listener: Listener | None = None, dask: str | None = None) -> list[StageRecord]:
     """Run the campaign flow; `listener` hears of each stage as it ends; `dask`: a scheduler's address, or "local"."""
-    return _run(campaign_flow, dask, plan, listener)
+    return _run(campaign_flow, listener, dask, plan)
 
 
 def run_flight(plan: Plan, flight: str, listener: Listener | None = None) -> list[StageRecord]:
     """Run the flight flow alone."""
-    return _run(flight_flow, None, plan, flight, listener)
+    return _run(flight_flow, listener, None, plan, flight)
 
 
 def run_line(plan: Plan, flight: str, line: str, listener: Listener | None = None) -> list[StageRecord]:
     """Run the line flow alone."""
-    return _run(line_flow, None, plan, flight, line, listener)
+    return _run(line_flow, listener, None, plan, flight, line)
 
 
-def _run(what: Any, dask: str | None, *arguments: Any) -> list[StageRecord]:
+def _run(what: Any, listener: Listener | None, dask: str | None, *arguments: Any) -> list[StageRecord]:
     runner: Any = ThreadPoolTaskRunner(max_workers=WORKERS) if dask is None else _dask_runner(dask)
-    with engine.quiet_engine():
-        records: list[StageRecord] = what.with_options(task_runner=runner)(*arguments)
+    token = _listener.set(listener)
+    try:
+        # One thread a matrix product: rounding hangs on how a product is shared out, and two lines run at once anyway.
+        with engine.quiet_engine(), threadpool_limits(limits=1):
+            records: list[StageRecord] = what.with_options(task_runner=runner)(*arguments)
+    finally:
+        _listener.reset(token)
     return records
 
 
@@ -146,6 +158,8 @@ def _dask_runner(address: str) -> Any:
         from prefect_dask import DaskTaskRunner
     except ImportError as error:
         raise InputError("--dask", "prefect-dask", "is not installed", 'pip install "tsmftis[dask]"') from error
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if address == "local":
-        return DaskTaskRunner(cluster_kwargs={"n_workers": WORKERS, "threads_per_worker": 1, "dashboard_address": None})
+        quiet = {"dashboard_address": None, "silence_logs": logging.CRITICAL}
+        return DaskTaskRunner(cluster_kwargs={"n_workers": WORKERS, "threads_per_worker": 1, **quiet})
     return DaskTaskRunner(address=address)

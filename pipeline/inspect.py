@@ -68,11 +68,13 @@ def inspect_campaign(campaign: Campaign) -> Inspection:
     if keys.thermal is None:
         if keys.flights:
             found.warnings.append("no chamber runs: the inertial data are not compensated for temperature")
-    else:
+    thermometers: set[int] = set()
+    if keys.thermal is not None:
         for role in ("train", "verify"):
             for name in getattr(keys.thermal, role):
                 chamber = found.attempt(campaign.chamber, name)
                 if chamber is not None:
+                    thermometers.add(chamber.temperatures.gyro.shape[2])
                     _describe_chamber(f"chamber {name} ({role})", chamber, found)
     for flight in keys.flights:
         imu = found.attempt(campaign.imu, flight.id)
@@ -80,6 +82,19 @@ def inspect_campaign(campaign: Campaign) -> Inspection:
         if imu is not None:
             assert instrument.imu is not None
             _describe_imu(f"flight {flight.id}: IMU", imu, instrument.imu.rate, found)
+            if (
+                keys.thermal is not None
+                and imu.temperatures is not None
+                and thermometers - {imu.temperatures.gyro.shape[2]}
+            ):
+                found.problems.append(
+                    InputError(
+                        campaign.path(flight.imu),
+                        "temperatures",
+                        f"are of {imu.temperatures.gyro.shape[2]} thermometers a gyro where the chamber runs have {sorted(thermometers)}",
+                        "record the flight with the chamber's thermometers, or leave thermal out of campaign.yaml",
+                    )
+                )
             if keys.thermal is not None and imu.temperatures is None:
                 found.warnings.append(
                     f"flight {flight.id}: the IMU file has no temperatures: its data are not compensated"

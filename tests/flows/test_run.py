@@ -318,6 +318,14 @@ def test_a_second_run_into_a_fresh_folder_gives_the_same_bytes(
     assert sorted(f"{stage}@{unit}" for stage, unit in told) == sorted(EVERY)
 
 
+def test_dask_workers_give_the_same_bytes(demo: Path, demo_run: Path, tmp_path: Path, tsmftis: Any) -> None:
+    """Other processes, other numbers of threads: rounding must not hang on them."""
+    answer = tsmftis("run", demo, "--out", tmp_path / "dask", "--dask", "local")
+    assert answer.code == 0, answer.out + answer.err
+    for name in ("F1/trajectory.nc", "F1/L01/spectra.nc", "F1/L02/cube.tif", "thermal_model.nc", "report.html"):
+        assert (tmp_path / "dask" / name).read_bytes() == (demo_run / name).read_bytes(), name
+
+
 def test_a_cached_run_gives_the_same_bytes(demo: Path, demo_run: Path, again: Path, tsmftis: Any) -> None:
     answer = tsmftis("run", demo, "--out", again)
     assert answer.code == 0
