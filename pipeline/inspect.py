@@ -65,9 +65,8 @@ def inspect_campaign(campaign: Campaign) -> Inspection:
         bench=len(keys.bench),
     )
     _describe_shared(campaign, found)
-    if keys.thermal is None:
-        if keys.flights:
-            found.warnings.append("no chamber runs: the inertial data are not compensated for temperature")
+    if keys.thermal is None and keys.flights:
+        found.warnings.append("no chamber runs: the inertial data are not compensated for temperature")
     thermometers: set[int] = set()
     if keys.thermal is not None:
         for role in ("train", "verify"):
@@ -91,7 +90,8 @@ def inspect_campaign(campaign: Campaign) -> Inspection:
                     InputError(
                         campaign.path(flight.imu),
                         "temperatures",
-                        f"are of {imu.temperatures.gyro.shape[2]} thermometers a gyro where the chamber runs have {sorted(thermometers)}",
+                        f"are of {imu.temperatures.gyro.shape[2]} thermometers a gyro, "
+                        f"the chamber runs' of {sorted(thermometers)}",
                         "record the flight with the chamber's thermometers, or leave thermal out of campaign.yaml",
                     )
                 )
