@@ -154,7 +154,6 @@ def forward(
     out_velocity: Any,
     out_q: Any,
     out_epoch: Any,
-    out_bias: Any,
     epoch_time: Any,
     epoch_P: Any,
     epoch_phi: Any,
@@ -193,7 +192,7 @@ def forward(
     epoch_time[0], epoch_fix[0] = time[0], -1
     epoch_P[0], epoch_dcm[0] = P, dcm
     epoch_bias[0] = bias
-    out_position[0], out_velocity[0], out_q[0], out_epoch[0], out_bias[0] = position, velocity, q, 0, bias
+    out_position[0], out_velocity[0], out_q[0], out_epoch[0] = position, velocity, q, 0
     last_accepted = time[0]
     for i in range(3):
         w0[i] = (gyro[1, i] - bias[i]) / (1.0 + bias[6 + i])
@@ -224,7 +223,9 @@ def forward(
                 if gap[k]:
                     gap_elapsed += dt
             start = stop
-            if at_fix or elapsed >= epoch_s - 1e-9:
+            # A gap is an epoch of its own, or its noise would be spread over the good samples beside it.
+            at_gap = stop == end and (gap[k] or (k + 1 < n and gap[k + 1]))
+            if at_fix or at_gap or elapsed >= epoch_s - 1e-9:
                 # Close the epoch: propagate, then (at a fix) update.
                 phi = epoch_phi[epoch]
                 if elapsed > 0.0:
@@ -338,7 +339,7 @@ def forward(
             f0[i] = (accel[k, i] - bias[3 + i]) / (1.0 + bias[9 + i])
         dt0 = time[k] - time[k - 1]
         # Where an epoch ends on the stamp, the estimate is the one after it.
-        out_position[k], out_velocity[k], out_q[k], out_epoch[k], out_bias[k] = position, velocity, q, epoch, bias
+        out_position[k], out_velocity[k], out_q[k], out_epoch[k] = position, velocity, q, epoch
     return epoch + 1
 
 

@@ -17,7 +17,7 @@ from tsmftis.rotation import dcm_to_rpy, exp_so3, quaternion_to_dcm, rpy_jacobia
 
 Array = NDArray[np.float64]
 
-BLOCK = 200_000  # samples turned at a time: matrices of a whole flight would be the peak of memory
+BLOCK = 50_000  # samples at a time: what is in between for a whole flight would be the peak of memory
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,20 @@ class NavigationResult:
 
 def assemble(imu: Imu, gnss: Gnss, s: dict[str, Any], start: Start, passes: int) -> NavigationResult:
     """The smoothed trajectory at every IMU stamp with its sigmas, from what filter and smoother left (`s`)."""
-    count, epoch, time = s["count"], s["epoch"], imu.time
+    n = imu.time.size
+    arrays = [np.empty(n), np.empty(n), np.empty(n), *(np.empty((n, 3)) for _ in range(7))]
+    for block in (slice(i, i + BLOCK) for i in range(0, n, BLOCK)):
+        for whole, part in zip(arrays, _block(imu, s, block), strict=True):
+            whole[block] = part
+    trajectory = Trajectory(imu.time, *arrays)
+    bias = s["epoch_bias"][: s["count"]] + s["correction"][:, 9:]
+    quality, figures = _quality(imu, gnss, s, trajectory, bias, start, passes)
+    return NavigationResult(trajectory, quality, figures)
+
+
+def _block(imu: Imu, s: dict[str, Any], block: slice) -> tuple[Array, ...]:
+    """The trajectory's arrays, in its order after time, for some of the stamps."""
+    count, epoch, time = s["count"], s["epoch"][block], imu.time[block]
     epoch_time, correction = s["epoch_time"][:count], s["correction"]
     following = np.minimum(epoch + 1, count - 1)
     span = epoch_time[following] - epoch_time[epoch]
@@ -40,42 +53,30 @@ def assemble(imu: Imu, gnss: Gnss, s: dict[str, Any], start: Start, passes: int)
     arriving = correction[following] + s["epoch_dx"][following] * (following > epoch)[:, None]
     shift = (1.0 - part) * correction[epoch] + part * arriving
 
-    north, east = radii_of_curvature(s["position"][:, 0])
-    height = s["position"][:, 2]
-    rpy = np.empty((time.size, 3))
-    for first in range(0, time.size, BLOCK):
-        block = slice(first, first + BLOCK)
-        rpy[block] = np.stack(dcm_to_rpy(exp_so3(shift[block, kalman.ATTITUDE]) @ quaternion_to_dcm(s["q"][block])), 1)
-    latitude = s["position"][:, 0] + shift[:, 0] / (north + height)
-    longitude = s["position"][:, 1] + shift[:, 1] / ((east + height) * np.cos(s["position"][:, 0]))
-    bias = s["bias"] + shift[:, 9:]
-
-    P = s["smoothed_P"]
-    epoch_rpy = np.stack(dcm_to_rpy(s["epoch_dcm"][:count]), 1)
-    J = rpy_jacobian(epoch_rpy)
-    variance = np.concatenate(
-        [np.einsum("nii->ni", P)[:, :6], np.einsum("nij,njk,nik->ni", J, P[:, 6:9, 6:9], J)], axis=1
-    )
-    sigma = np.sqrt(np.maximum(variance, 0.0))
-    sigmas = np.stack([np.interp(time, epoch_time, sigma[:, i]) for i in range(9)], 1)
-
-    rate = (imu.gyro - bias[:, 0:3]) / (1.0 + bias[:, 6:9])
-    force = (imu.accel - bias[:, 3:6]) / (1.0 + bias[:, 9:12])
-    trajectory = Trajectory(
-        time,
-        latitude,
-        longitude,
+    latitude, longitude, height = s["position"][block].T
+    north, east = radii_of_curvature(latitude)
+    rpy = np.stack(dcm_to_rpy(exp_so3(shift[:, kalman.ATTITUDE]) @ quaternion_to_dcm(s["q"][block])), 1)
+    bias = s["epoch_bias"][epoch] + shift[:, 9:]
+    sigma = (1.0 - part) * s["sigma"][epoch] + part * s["sigma"][following]
+    return (
+        latitude + shift[:, 0] / (north + height),
+        longitude + shift[:, 1] / ((east + height) * np.cos(latitude)),
         height - shift[:, 2],
-        s["velocity"] + shift[:, 3:6],
+        s["velocity"][block] + shift[:, kalman.VELOCITY],
         rpy,
-        sigmas[:, 0:3],
-        sigmas[:, 3:6],
-        sigmas[:, 6:9],
-        rate,
-        force,
+        sigma[:, 0:3],
+        sigma[:, 3:6],
+        sigma[:, 6:9],
+        (imu.gyro[block] - bias[:, 0:3]) / (1.0 + bias[:, 6:9]),
+        (imu.accel[block] - bias[:, 3:6]) / (1.0 + bias[:, 9:12]),
     )
-    quality, figures = _quality(imu, gnss, s, trajectory, bias, start, passes)
-    return NavigationResult(trajectory, quality, figures)
+
+
+def sigmas(covariance: Array, dcm: Array) -> Array:
+    """Sigmas (n, 9) of position [m], velocity [m/s], roll, pitch, yaw [rad] from covariances (n, 9, 9) in NED; dcm (n, 3, 3)."""
+    J = rpy_jacobian(np.stack(dcm_to_rpy(dcm), 1))
+    attitude = np.einsum("nij,njk,nik->ni", J, covariance[:, kalman.ATTITUDE, kalman.ATTITUDE], J)
+    return np.sqrt(np.maximum(np.concatenate([np.einsum("nii->ni", covariance)[:, :6], attitude], axis=1), 0.0))
 
 
 def _quality(

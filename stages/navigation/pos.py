@@ -14,7 +14,7 @@ from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu, ThermalCorrection
 from stages.navigation import kalman
 from stages.navigation.alignment import Start, align, starting_at
-from stages.navigation.output import NavigationResult, assemble
+from stages.navigation.output import NavigationResult, assemble, sigmas
 from tsmftis.camera import Mounting
 from tsmftis.geodesy import radii_of_curvature
 from tsmftis.inertial import ImuModel
@@ -30,7 +30,7 @@ class NavigationSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    epoch_s: float = Field(0.1, gt=0, le=1.0, description="longest step of the covariance")
+    epoch_s: float = Field(0.2, gt=0, le=1.0, description="longest step of the covariance")
     gate_probability: float = Field(1e-6, gt=0, lt=0.1, description="chance that a good fix is rejected")
     reentry_s: float = Field(
         5.0, gt=0, description="without an accepted fix for so long, fixes are weighed down instead of rejected"
@@ -70,7 +70,9 @@ def run(
         )
     start = _start(imu, gnss, lever, settings, initial)
     used_imu = _from(imu, start.time)
+    solution: dict[str, Any] = {}
     for number in range(settings.passes):
+        solution.clear()  # the last pass's matrices make room for this one's
         solution = _filter_and_smooth(used_imu, gnss, model, lever, settings, start)
         shift = solution["correction"][0]
         if np.linalg.norm(shift[kalman.ATTITUDE]) < np.deg2rad(0.5) or number == settings.passes - 1:
@@ -79,17 +81,22 @@ def run(
         # prior of position, velocity and attitude moves with it and keeps its width, which is nothing beside the flight's own
         # information; that of the sensors' errors stays where it was, since it does count.
         start = _shifted(start, shift)
+    for finished in ("epoch_P", "epoch_phi", "H", "K", "S_inv"):
+        del solution[finished]
     return assemble(used_imu, gnss, solution, start, number + 1)
 
 
 def in_body_axes(imu: Imu, mounting: Mounting, correction: ThermalCorrection | None) -> Imu:
     """Compensated inertial data turned from the IMU's axes into the body's."""
-    gyro, accel = imu.gyro, imu.accel
+    gyro, accel = imu.gyro.copy(), imu.accel.copy()
     if correction is not None:
-        gyro = gyro - np.stack([np.interp(imu.time, correction.time, correction.gyro[:, i]) for i in range(3)], 1)
-        accel = accel - np.stack([np.interp(imu.time, correction.time, correction.accel[:, i]) for i in range(3)], 1)
-    turn = mounting.dcm_imu_to_body
-    return Imu(imu.time, np.ascontiguousarray(gyro @ turn.T), np.ascontiguousarray(accel @ turn.T), imu.temperatures)
+        for i in range(3):
+            gyro[:, i] -= np.interp(imu.time, correction.time, correction.gyro[:, i])
+            accel[:, i] -= np.interp(imu.time, correction.time, correction.accel[:, i])
+    if mounting.imu_to_body.any():
+        turn = mounting.dcm_imu_to_body
+        gyro, accel = np.ascontiguousarray(gyro @ turn.T), np.ascontiguousarray(accel @ turn.T)
+    return Imu(imu.time, gyro, accel)
 
 
 def _start(
@@ -111,11 +118,13 @@ def _start(
 def _from(imu: Imu, time: float) -> Imu:
     """The samples after `time`, with a first stamp exactly there: sample 0 is only the start, its rates are not used."""
     first = int(np.searchsorted(imu.time, time, side="right"))
-    return Imu(
-        np.concatenate([[time], imu.time[first:]]),
-        np.concatenate([imu.gyro[first : first + 1], imu.gyro[first:]]),
-        np.concatenate([imu.accel[first : first + 1], imu.accel[first:]]),
-    )
+    if first == 0:
+        stamps, gyro, accel = (np.concatenate([values[:1], values]) for values in (imu.time, imu.gyro, imu.accel))
+        imu = Imu(stamps, gyro, accel)
+        first = 1
+    stamps = imu.time[first - 1 :].copy()
+    stamps[0] = time
+    return Imu(stamps, imu.gyro[first - 1 :], imu.accel[first - 1 :])
 
 
 def _shifted(start: Start, shift: Array) -> Start:
@@ -177,14 +186,13 @@ def _filter_and_smooth(
     fix_rate = np.stack([np.interp(gnss.time, middle, imu.gyro[1:, i]) for i in range(3)], 1)
     gates = np.array([0.0] + [chi2.isf(settings.gate_probability, m) for m in range(1, 7)])
 
-    size = nfix + int(np.ceil((imu.time[-1] - imu.time[0]) / settings.epoch_s)) + 2
+    size = nfix + int(np.ceil((imu.time[-1] - imu.time[0]) / settings.epoch_s)) + 2 * int(gap.sum()) + 2
     s = kalman.NSTATE
     out = {
         "position": np.empty((n, 3)),
         "velocity": np.empty((n, 3)),
         "q": np.empty((n, 4)),
         "epoch": np.empty(n, np.int64),
-        "bias": np.empty((n, 12)),
         "epoch_time": np.empty(size),
         "epoch_P": np.empty((size, s, s)),
         "epoch_phi": np.empty((size, s, s)),
@@ -227,7 +235,6 @@ def _filter_and_smooth(
         out["velocity"],
         out["q"],
         out["epoch"],
-        out["bias"],
         out["epoch_time"],
         out["epoch_P"],
         out["epoch_phi"],
@@ -260,6 +267,7 @@ def _filter_and_smooth(
         "count": count,
         "correction": correction,
         "smoothed_P": smoothed,
+        "sigma": sigmas(smoothed, out["epoch_dcm"][:count]),
         "gap": gap,
         "fix_size": fix_size,
         "variance": variance,
