@@ -21,7 +21,7 @@ from flows.settings import Settings
 from pipeline.campaign import Campaign, read_campaign
 from pipeline.datasets import write_dataset
 from pipeline.errors import InputError
-from pipeline.formats import sbet
+from pipeline.formats import sbet, smrmsg
 from pipeline.raster import Dem, Quicklook, open_cube
 from pipeline.records import CameraPoses, Imu, Spectra, ThermalCorrection, Tracks, Trajectory
 from pipeline.run_stage import StageRecord, run_stage, write_json
@@ -128,8 +128,10 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
     model = plan.out / "thermal_model.nc"
     inputs = {"imu": campaign.path(entry.imu), "gnss": campaign.path(entry.gnss)}
     outputs = {
-        n: f"{flight}/{f}"
-        for n, f in (("trajectory", "trajectory.nc"), ("sbet", "trajectory.sbet"), ("figures", "navigation.json"))
+        "trajectory": f"{flight}/trajectory.nc",
+        "sbet": f"{flight}/trajectory.sbet",
+        "smrmsg": f"{flight}/trajectory.smrmsg",
+        "figures": f"{flight}/navigation.json",
     }
     about = {
         "title": f"smoothed trajectory of flight {flight}",
@@ -160,6 +162,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
             write_dataset(correction.to_dataset(), to["correction"])
         write_dataset(result.trajectory.to_dataset().assign_attrs(about), to["trajectory"])
         sbet.write_sbet(sbet.from_trajectory(result.trajectory), to["sbet"])
+        smrmsg.write_smrmsg(smrmsg.from_trajectory(result.trajectory), to["smrmsg"])
         write_json(to["figures"], {"quality": result.quality, "figures": result.figures})
         return result.quality | {"compensated": compensated} | (_reach(correction) if correction is not None else {})
 
@@ -167,7 +170,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         plan.out,
         "navigation",
         flight,
-        ("stages.navigation", "stages.thermal", "pipeline.formats.sbet"),
+        ("stages.navigation", "stages.thermal", "pipeline.formats.sbet", "pipeline.formats.smrmsg"),
         {
             "settings": _plain(plan.settings.navigation),
             "about": about,

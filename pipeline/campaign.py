@@ -24,7 +24,7 @@ from tsmftis.interferometer import Interferometer
 ZARR_MARKERS = ("zarr.json", ".zgroup", ".zmetadata")
 # A flight's folder stands beside these in the results, a line's beside those.
 TAKEN_BY_RESULTS = {"bench", "run.json", "report.html", "thermal_model.nc", "thermal_figures.json", ".stages"}
-TAKEN_BY_FLIGHT = {"trajectory.nc", "trajectory.sbet", "navigation.json", "thermal.nc"}
+TAKEN_BY_FLIGHT = {"trajectory.nc", "trajectory.sbet", "trajectory.smrmsg", "navigation.json", "thermal.nc"}
 
 Identifier = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]+$")]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

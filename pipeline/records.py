@@ -207,6 +207,23 @@ class Gnss:
             quality,
         )
 
+    def to_dataset(self) -> xr.Dataset:
+        variables: dict[str, Any] = {
+            "latitude": (("time",), np.rad2deg(self.latitude), {"units": "degrees_north"}),
+            "longitude": (("time",), np.rad2deg(self.longitude), {"units": "degrees_east"}),
+            "height": (("time",), self.height, {"units": "m", "long_name": "height above the WGS-84 ellipsoid"}),
+            "sigma_position": (("time", "ned"), self.sigma_position, {"units": "m"}),
+            "quality": (
+                ("time",),
+                self.quality.astype(np.int8),
+                {"flag_values": "1 2 5", "flag_meanings": "fixed float single"},
+            ),
+        }
+        if self.velocity is not None and self.sigma_velocity is not None:
+            variables["velocity"] = (("time", "ned"), self.velocity, {"units": "m s-1"})
+            variables["sigma_velocity"] = (("time", "ned"), self.sigma_velocity, {"units": "m s-1"})
+        return xr.Dataset(variables, {"time": (("time",), self.time, {"units": "s"}), "ned": ["north", "east", "down"]})
+
 
 def _in_range(values: Array, low: float, high: float, where: Path, place: str, unit: str) -> None:
     outside = (values < low) | (values > high)

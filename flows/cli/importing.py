@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
+import xarray as xr
 from rich.console import Console
 
 from pipeline.datasets import write_dataset
@@ -28,12 +30,8 @@ def import_opus(
     """Write an OPUS file's interferogram, its parameters and the vendor's spectrum as a bench file of a campaign."""
     from pipeline.formats.opus import read_opus
 
-    if out.is_dir() or not out.parent.is_dir():
-        raise InputError(out, "OUT", "is not a file name in an existing folder", "give for instance bench/sample.nc")
     bench = read_opus(file)
-    temporary = out.with_name(out.name + ".tmp")
-    write_dataset(bench.to_dataset(), temporary)
-    os.replace(temporary, out)
+    _write(bench.to_dataset(), out)
     scans, samples = bench.interferogram.shape
     Console(highlight=False, soft_wrap=True).print(
         f"{out}: {scans} scan{'s' if scans > 1 else ''} of {samples} samples, apodization {bench.apodization or 'not told'}, "
@@ -41,3 +39,34 @@ def import_opus(
         f"vendor's spectrum {'included' if bench.reference is not None else 'not in the file'}",
         markup=False,
     )
+
+
+@app.command("pos")
+def import_pos(
+    file: Annotated[Path, typer.Argument(help="An RTKLIB solution (.pos): latitude, longitude, ellipsoidal height.")],
+    out: Annotated[Path, typer.Argument(help="The gnss file (NetCDF-4) to write.")],
+    epoch: Annotated[
+        datetime | None,
+        typer.Option(
+            "--epoch", help="The campaign's epoch (GPS time); default: the start of the first fix's GPS week."
+        ),
+    ] = None,
+) -> None:
+    """Write an RTKLIB solution as a gnss file of a campaign; the epoch that its times count from is printed."""
+    from pipeline.formats.rtklib import read_pos
+
+    gnss, start = read_pos(file, epoch)
+    _write(gnss.to_dataset(), out)
+    Console(highlight=False, soft_wrap=True).print(
+        f"{out}: {gnss.time.size} fixes, velocity {'included' if gnss.velocity is not None else 'not in the file'}; "
+        f"in campaign.yaml write  time: {{scale: GPS, epoch: '{start.isoformat()}Z'}}",
+        markup=False,
+    )
+
+
+def _write(dataset: xr.Dataset, out: Path) -> None:
+    if out.is_dir() or not out.parent.is_dir():
+        raise InputError(out, "OUT", "is not a file name in an existing folder", "give for instance bench/sample.nc")
+    temporary = out.with_name(out.name + ".tmp")
+    write_dataset(dataset, temporary)
+    os.replace(temporary, out)
