@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from pipeline.formats.binary import read_records, write_records
 from pipeline.records import Trajectory
 from tsmftis.geodesy import earth_rate_ned, normal_gravity, radii_of_curvature
 from tsmftis.rotation import rpy_to_dcm
@@ -64,23 +65,7 @@ DTYPE = np.dtype([(name, "<f8") for name in LIMITS])
 
 def read_sbet(path: Path) -> Records:
     """The records (n,) of an SBET file as a structured array of `DTYPE`; raises InputError where it cannot be one."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            path, "file", f"cannot be read ({error.strerror})", "correct the name or its permissions"
-        ) from error
-    size = DTYPE.itemsize
-    if not content:
-        raise InputError(path, "file", "is empty", f"an SBET has {size} bytes a record")
-    if len(content) % size:
-        raise InputError(
-            path,
-            f"record {len(content) // size}",
-            f"is cut: {len(content)} bytes are no multiple of {size}",
-            "the file is truncated or no SBET: copy it again",
-        )
-    records = np.frombuffer(content, DTYPE).copy()
+    records = read_records(path, DTYPE, "SBET")
     for name, limit in LIMITS.items():
         bad = ~(np.abs(records[name]) <= limit)  # catches NaN as well
         if bad.any():
@@ -105,9 +90,7 @@ def read_sbet(path: Path) -> Records:
 
 def write_sbet(records: Records, path: Path) -> None:
     """Write records of `DTYPE`; what `read_sbet` gave comes out bit for bit."""
-    if records.dtype != DTYPE or records.ndim != 1:
-        raise ValueError(f"records must be (n,) of the SBET dtype, not {records.shape} of {records.dtype}")
-    path.write_bytes(records.tobytes())
+    write_records(records, DTYPE, path, "SBET")
 
 
 def from_trajectory(trajectory: Trajectory) -> Records:

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import InputError
+from pipeline.formats.binary import read_records, write_records
 from pipeline.records import Trajectory
 
 FIELDS = (
@@ -35,20 +36,7 @@ ARC_MINUTES = 60.0 * 180.0 / np.pi  # of one radian
 
 def read_smrmsg(path: Path) -> NDArray[Any]:
     """Records (n,) of an SMRMSG file; raises InputError where it cannot be one."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            path, "file", f"cannot be read ({error.strerror})", "correct the name or its permissions"
-        ) from error
-    if not content or len(content) % DTYPE.itemsize:
-        raise InputError(
-            path,
-            "file",
-            f"has {len(content)} bytes",
-            f"an SMRMSG has {DTYPE.itemsize} bytes a record: it is truncated or none",
-        )
-    records = np.frombuffer(content, DTYPE).copy()
+    records = read_records(path, DTYPE, "SMRMSG")
     for name in FIELDS:
         bad = ~np.isfinite(records[name]) | ((records[name] < 0) if name != "time" else False)
         if bad.any():
@@ -61,9 +49,7 @@ def read_smrmsg(path: Path) -> NDArray[Any]:
 
 def write_smrmsg(records: NDArray[Any], path: Path) -> None:
     """Write records of `DTYPE`; what `read_smrmsg` gave comes out bit for bit."""
-    if records.dtype != DTYPE or records.ndim != 1:
-        raise ValueError(f"records must be (n,) of the SMRMSG dtype, not {records.shape} of {records.dtype}")
-    path.write_bytes(records.tobytes())
+    write_records(records, DTYPE, path, "SMRMSG")
 
 
 def from_trajectory(trajectory: Trajectory) -> NDArray[Any]:

@@ -18,7 +18,7 @@ References
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -126,18 +126,72 @@ def _propagate(P: Any, transition: Any, noise: Any, dt: float) -> Any:
     return P_next
 
 
+class Fixes(NamedTuple):
+    """GNSS fixes (m,): time [s]; lat, lon [rad], height [m] (m, 3); velocity NED (m, 3); variances (m, 6); the body's rate at
+    the fix (m, 3) [rad/s]; size 6 with velocity, 3 without."""
+
+    time: Any
+    position: Any
+    velocity: Any
+    variance: Any
+    rate: Any
+    size: Any
+
+
+class Store(NamedTuple):
+    """What the filter leaves behind, filled in place: the estimate at each stamp and the epochs closed by then; at each epoch's
+    end its time, covariance, transition from the epoch before, fix (or −1), correction taken up, biases and C; for each fix
+    H, S⁻¹, K, innovation, normalised innovation squared, and whether it was used."""
+
+    position: Any
+    velocity: Any
+    q: Any
+    epoch: Any
+    epoch_time: Any
+    epoch_P: Any
+    epoch_phi: Any
+    epoch_fix: Any
+    epoch_dx: Any
+    epoch_bias: Any
+    epoch_dcm: Any
+    H: Any
+    S_inv: Any
+    K: Any
+    innovation: Any
+    nis: Any
+    used: Any
+
+    @classmethod
+    def empty(cls, stamps: int, epochs: int, fixes: int) -> Store:
+        n = NSTATE
+        return cls(
+            np.empty((stamps, 3)),
+            np.empty((stamps, 3)),
+            np.empty((stamps, 4)),
+            np.empty(stamps, np.int64),
+            np.empty(epochs),
+            np.empty((epochs, n, n)),
+            np.empty((epochs, n, n)),
+            np.full(epochs, -1, np.int64),
+            np.zeros((epochs, n)),
+            np.empty((epochs, 12)),
+            np.empty((epochs, 3, 3)),
+            np.zeros((fixes, 6, n)),
+            np.zeros((fixes, 6, 6)),
+            np.zeros((fixes, n, 6)),
+            np.zeros((fixes, 6)),
+            np.full(fixes, np.nan),
+            np.zeros(fixes, np.bool_),
+        )
+
+
 @numba.njit(cache=True, nogil=True)
 def forward(
     time: Any,
     gyro: Any,
     accel: Any,
     gap: Any,
-    fix_time: Any,
-    fix_position: Any,
-    fix_velocity: Any,
-    fix_variance: Any,
-    fix_rate: Any,
-    fix_size: Any,
+    fixes: Any,
     lever: Any,
     position: Any,
     velocity: Any,
@@ -150,33 +204,16 @@ def forward(
     epoch_s: float,
     gates: Any,
     reentry_s: float,
-    out_position: Any,
-    out_velocity: Any,
-    out_q: Any,
-    out_epoch: Any,
-    epoch_time: Any,
-    epoch_P: Any,
-    epoch_phi: Any,
-    epoch_fix: Any,
-    epoch_dx: Any,
-    epoch_bias: Any,
-    epoch_dcm: Any,
-    H_all: Any,
-    S_inv_all: Any,
-    K_all: Any,
-    innovation_all: Any,
-    nis: Any,
-    used: Any,
+    store: Any,
 ) -> Any:
     """Filter the whole flight; returns the number of epochs.
 
     time (n,): stamps, time[0] is the start; gyro, accel (n, 3): means over (time[i−1], time[i]], body axes. Fixes are
     applied at their exact times: an interval with a fix inside is cut there. bias (12,): gyro and accelerometer bias,
-    gyro and accelerometer scale factor. `fix_size` is 6 with velocity, 3 without. Outputs are filled in place: the
-    estimate at every stamp, and at every epoch's end what the smoother needs.
+    gyro and accelerometer scale factor.
     """
     n = time.size
-    nfix = fix_time.size
+    nfix = fixes.time.size
     P = P0.copy()
     dcm = np.empty((3, 3))
     quaternion_to_dcm(q, dcm)
@@ -187,12 +224,12 @@ def forward(
     q_epoch = np.empty(NSTATE)
     elapsed, gap_elapsed = 0.0, 0.0
     epoch, fix = 0, 0
-    while fix < nfix and fix_time[fix] < time[0]:
+    while fix < nfix and fixes.time[fix] < time[0]:
         fix += 1
-    epoch_time[0], epoch_fix[0] = time[0], -1
-    epoch_P[0], epoch_dcm[0] = P, dcm
-    epoch_bias[0] = bias
-    out_position[0], out_velocity[0], out_q[0], out_epoch[0] = position, velocity, q, 0
+    store.epoch_time[0], store.epoch_fix[0] = time[0], -1
+    store.epoch_P[0], store.epoch_dcm[0] = P, dcm
+    store.epoch_bias[0] = bias
+    store.position[0], store.velocity[0], store.q[0], store.epoch[0] = position, velocity, q, 0
     last_accepted = time[0]
     for i in range(3):
         w0[i] = (gyro[1, i] - bias[i]) / (1.0 + bias[6 + i])
@@ -203,8 +240,8 @@ def forward(
         while start < end:
             stop = end
             at_fix = False
-            if fix < nfix and fix_time[fix] <= end:
-                stop, at_fix = max(fix_time[fix], start), True
+            if fix < nfix and fixes.time[fix] <= end:
+                stop, at_fix = max(fixes.time[fix], start), True
             dt = stop - start
             if dt > 0.0:
                 for i in range(3):
@@ -227,7 +264,7 @@ def forward(
             at_gap = stop == end and (gap[k] or (k + 1 < n and gap[k + 1]))
             if at_fix or at_gap or elapsed >= epoch_s - 1e-9:
                 # Close the epoch: propagate, then (at a fix) update.
-                phi = epoch_phi[epoch]
+                phi = store.epoch_phi[epoch]
                 if elapsed > 0.0:
                     dynamics(
                         position,
@@ -252,25 +289,25 @@ def forward(
                 sum_cf[:] = 0.0
                 elapsed, gap_elapsed = 0.0, 0.0
                 epoch += 1
-                epoch_time[epoch], epoch_fix[epoch] = stop, -1
-                epoch_dx[epoch] = 0.0
+                store.epoch_time[epoch], store.epoch_fix[epoch] = stop, -1
+                store.epoch_dx[epoch] = 0.0
                 if at_fix:
-                    m = fix_size[fix]
-                    H = H_all[fix]
+                    m = fixes.size[fix]
+                    H = store.H[fix]
                     H[:] = 0.0
                     rn, re = radii(position[0])
                     arm = dcm @ lever
-                    y = innovation_all[fix]
-                    y[0] = (fix_position[fix, 0] - position[0]) * (rn + position[2]) - arm[0]
-                    y[1] = (fix_position[fix, 1] - position[1]) * (re + position[2]) * math.cos(position[0]) - arm[1]
-                    y[2] = -(fix_position[fix, 2] - position[2]) - arm[2]
+                    y = store.innovation[fix]
+                    y[0] = (fixes.position[fix, 0] - position[0]) * (rn + position[2]) - arm[0]
+                    y[1] = (fixes.position[fix, 1] - position[1]) * (re + position[2]) * math.cos(position[0]) - arm[1]
+                    y[2] = -(fixes.position[fix, 2] - position[2]) - arm[2]
                     for i in range(3):
                         H[i, i] = 1.0
                     _cross_into(H, 0, 6, arm[0], arm[1], arm[2], -1.0)
                     if m == 6:
                         rate = np.empty(3)
                         for i in range(3):
-                            rate[i] = (fix_rate[fix, i] - bias[i]) / (1.0 + bias[6 + i])
+                            rate[i] = (fixes.rate[fix, i] - bias[i]) / (1.0 + bias[6 + i])
                         # ω_eb in body axes: Earth rotation taken off.
                         ien, ied = OMEGA * math.cos(position[0]), -OMEGA * math.sin(position[0])
                         for i in range(3):
@@ -281,7 +318,7 @@ def forward(
                         swing[2] = rate[0] * lever[1] - rate[1] * lever[0]
                         swing = dcm @ swing
                         for i in range(3):
-                            y[3 + i] = fix_velocity[fix, i] - velocity[i] - swing[i]
+                            y[3 + i] = fixes.velocity[fix, i] - velocity[i] - swing[i]
                             H[3 + i, 3 + i] = 1.0
                         _cross_into(H, 3, 6, swing[0], swing[1], swing[2], -1.0)
                         # v_antenna has C(−δb×l) = C[l×]δb
@@ -292,20 +329,20 @@ def forward(
                     PHt = P @ np.ascontiguousarray(Hm.T)
                     S = Hm @ PHt
                     for i in range(m):
-                        S[i, i] += fix_variance[fix, i]
+                        S[i, i] += fixes.variance[fix, i]
                     S_inv = np.linalg.inv(S)
-                    nis[fix] = y[:m] @ (S_inv @ y[:m])
+                    store.nis[fix] = y[:m] @ (S_inv @ y[:m])
                     inflate = 1.0
-                    accept = nis[fix] <= gates[m]
+                    accept = store.nis[fix] <= gates[m]
                     if not accept and stop - last_accepted >= reentry_s:
                         # The filter may be the one that is wrong: let the fix in, weighed down to what the gate allows.
-                        inflate = nis[fix] / gates[m]
+                        inflate = store.nis[fix] / gates[m]
                         for i in range(m):
-                            S[i, i] += (inflate - 1.0) * fix_variance[fix, i]
+                            S[i, i] += (inflate - 1.0) * fixes.variance[fix, i]
                         S_inv = np.linalg.inv(S)
-                        nis[fix] = y[:m] @ (S_inv @ y[:m])
+                        store.nis[fix] = y[:m] @ (S_inv @ y[:m])
                         accept = True
-                    used[fix] = accept
+                    store.used[fix] = accept
                     if accept:
                         last_accepted = stop
                         K = PHt @ S_inv
@@ -313,7 +350,7 @@ def forward(
                         C = identity - K @ Hm
                         P = C @ P @ np.ascontiguousarray(C.T)
                         for r in range(m):
-                            variance = inflate * fix_variance[fix, r]
+                            variance = inflate * fixes.variance[fix, r]
                             for i in range(NSTATE):
                                 scaled = K[i, r] * variance
                                 for j in range(NSTATE):
@@ -327,36 +364,24 @@ def forward(
                         quaternion_to_dcm(q, dcm)
                         for i in range(12):
                             bias[i] += dx[9 + i]
-                        epoch_dx[epoch] = dx
-                        epoch_fix[epoch] = fix
-                        S_inv_all[fix, :m, :m] = S_inv
-                        K_all[fix, :, :m] = K
+                        store.epoch_dx[epoch] = dx
+                        store.epoch_fix[epoch] = fix
+                        store.S_inv[fix, :m, :m] = S_inv
+                        store.K[fix, :, :m] = K
                     fix += 1
-                epoch_P[epoch], epoch_dcm[epoch] = P, dcm
-                epoch_bias[epoch] = bias
+                store.epoch_P[epoch], store.epoch_dcm[epoch] = P, dcm
+                store.epoch_bias[epoch] = bias
         for i in range(3):
             w0[i] = (gyro[k, i] - bias[i]) / (1.0 + bias[6 + i])
             f0[i] = (accel[k, i] - bias[3 + i]) / (1.0 + bias[9 + i])
         dt0 = time[k] - time[k - 1]
         # Where an epoch ends on the stamp, the estimate is the one after it.
-        out_position[k], out_velocity[k], out_q[k], out_epoch[k] = position, velocity, q, epoch
+        store.position[k], store.velocity[k], store.q[k], store.epoch[k] = position, velocity, q, epoch
     return epoch + 1
 
 
 @numba.njit(cache=True, nogil=True)
-def backward(
-    count: int,
-    epoch_P: Any,
-    epoch_phi: Any,
-    epoch_fix: Any,
-    H_all: Any,
-    S_inv_all: Any,
-    K_all: Any,
-    innovation_all: Any,
-    fix_size: Any,
-    correction: Any,
-    smoothed_P: Any,
-) -> None:
+def backward(count: int, fix_size: Any, store: Any, correction: Any, smoothed_P: Any) -> None:
     """Modified Bryson–Frazier recursion over the first `count` epochs.
 
     Fills correction (count, 21), to be added to the estimate after each epoch, and the smoothed covariance of position,
@@ -367,22 +392,22 @@ def backward(
     Lam = np.zeros((NSTATE, NSTATE))
     identity = np.eye(NSTATE)
     for e in range(count - 1, -1, -1):
-        P = epoch_P[e]
+        P = store.epoch_P[e]
         correction[e] = -(P @ lam)
         rows = np.ascontiguousarray(P[:9])
         smoothed_P[e] = np.ascontiguousarray(P[:9, :9]) - rows @ Lam @ np.ascontiguousarray(rows.T)
-        fix = epoch_fix[e]
+        fix = store.epoch_fix[e]
         if fix >= 0:
             m = fix_size[fix]
-            H = np.ascontiguousarray(H_all[fix, :m])
-            S_inv = np.ascontiguousarray(S_inv_all[fix, :m, :m])
-            K = np.ascontiguousarray(K_all[fix, :, :m])
+            H = np.ascontiguousarray(store.H[fix, :m])
+            S_inv = np.ascontiguousarray(store.S_inv[fix, :m, :m])
+            K = np.ascontiguousarray(store.K[fix, :, :m])
             Ct = np.ascontiguousarray((identity - K @ H).T)
             Ht_S = np.ascontiguousarray(H.T) @ S_inv
-            lam = Ct @ lam - Ht_S @ innovation_all[fix, :m]
+            lam = Ct @ lam - Ht_S @ store.innovation[fix, :m]
             Lam = Ct @ Lam @ np.ascontiguousarray(Ct.T) + Ht_S @ H
         if e > 0:
-            phi_t = np.ascontiguousarray(epoch_phi[e - 1].T)
+            phi_t = np.ascontiguousarray(store.epoch_phi[e - 1].T)
             lam = phi_t @ lam
             Lam = phi_t @ Lam @ np.ascontiguousarray(phi_t.T)
             for i in range(NSTATE):

@@ -187,38 +187,17 @@ def _filter_and_smooth(
     gates = np.array([0.0] + [chi2.isf(settings.gate_probability, m) for m in range(1, 7)])
 
     size = nfix + int(np.ceil((imu.time[-1] - imu.time[0]) / settings.epoch_s)) + 2 * int(gap.sum()) + 2
-    s = kalman.NSTATE
-    out = {
-        "position": np.empty((n, 3)),
-        "velocity": np.empty((n, 3)),
-        "q": np.empty((n, 4)),
-        "epoch": np.empty(n, np.int64),
-        "epoch_time": np.empty(size),
-        "epoch_P": np.empty((size, s, s)),
-        "epoch_phi": np.empty((size, s, s)),
-        "epoch_fix": np.full(size, -1, np.int64),
-        "epoch_dx": np.zeros((size, s)),
-        "epoch_bias": np.empty((size, 12)),
-        "epoch_dcm": np.empty((size, 3, 3)),
-        "H": np.zeros((nfix, 6, s)),
-        "S_inv": np.zeros((nfix, 6, 6)),
-        "K": np.zeros((nfix, s, 6)),
-        "innovation": np.zeros((nfix, 6)),
-        "nis": np.full(nfix, np.nan),
-        "used": np.zeros(nfix, np.bool_),
-    }
+    store = kalman.Store.empty(n, size, nfix)
     tau = np.repeat([model.gyro.bias_correlation_time, model.accel.bias_correlation_time], 3)
+    fixes = kalman.Fixes(
+        gnss.time, np.stack([gnss.latitude, gnss.longitude, gnss.height], 1), velocity, variance, fix_rate, fix_size
+    )
     count = kalman.forward(
         imu.time,
         imu.gyro,
         imu.accel,
         gap,
-        gnss.time,
-        np.stack([gnss.latitude, gnss.longitude, gnss.height], 1),
-        velocity,
-        variance,
-        fix_rate,
-        fix_size,
+        fixes,
         lever,
         start.position.copy(),
         start.velocity.copy(),
@@ -231,43 +210,15 @@ def _filter_and_smooth(
         settings.epoch_s,
         gates,
         settings.reentry_s,
-        out["position"],
-        out["velocity"],
-        out["q"],
-        out["epoch"],
-        out["epoch_time"],
-        out["epoch_P"],
-        out["epoch_phi"],
-        out["epoch_fix"],
-        out["epoch_dx"],
-        out["epoch_bias"],
-        out["epoch_dcm"],
-        out["H"],
-        out["S_inv"],
-        out["K"],
-        out["innovation"],
-        out["nis"],
-        out["used"],
+        store,
     )
-    correction, smoothed = np.zeros((count, s)), np.empty((count, 9, 9))
-    kalman.backward(
-        count,
-        out["epoch_P"],
-        out["epoch_phi"],
-        out["epoch_fix"],
-        out["H"],
-        out["S_inv"],
-        out["K"],
-        out["innovation"],
-        fix_size,
-        correction,
-        smoothed,
-    )
-    return out | {
+    correction, smoothed = np.zeros((count, kalman.NSTATE)), np.empty((count, 9, 9))
+    kalman.backward(count, fix_size, store, correction, smoothed)
+    return store._asdict() | {
         "count": count,
         "correction": correction,
         "smoothed_P": smoothed,
-        "sigma": sigmas(smoothed, out["epoch_dcm"][:count]),
+        "sigma": sigmas(smoothed, store.epoch_dcm[:count]),
         "gap": gap,
         "fix_size": fix_size,
         "variance": variance,

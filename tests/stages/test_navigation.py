@@ -315,7 +315,10 @@ def test_smoother_equals_batch_least_squares() -> None:
             x, P = x + K[e, :, :m] @ y[e, :m], (np.eye(n) - K[e, :, :m] @ h) @ P
         covariance[e], estimate[e] = 0.5 * (P + P.T), x
     correction, smoothed = np.empty((epochs, n)), np.empty((epochs, 9, 9))
-    kalman.backward(epochs, covariance, phi, fix, H, S_inv, K, y, size, correction, smoothed)
+    store = kalman.Store.empty(1, epochs, epochs)._replace(
+        epoch_P=covariance, epoch_phi=phi, epoch_fix=fix, H=H, S_inv=S_inv, K=K, innovation=y
+    )
+    kalman.backward(epochs, size, store, correction, smoothed)
 
     rows, right = [np.eye(epochs * n)[:n] / np.sqrt(np.diag(p0))[:, None]], [start / np.sqrt(np.diag(p0))]
     for e in range(1, epochs):
