@@ -363,12 +363,18 @@ def bench(wavenumber: Array, spectrum: Array, reference: Array | None) -> go.Fig
         scale = float(np.linalg.norm(reference)) / np.sqrt(reference.size)
         _, left = thin(wavenumber, (spectrum - reference) / scale)
         figure.add_scatter(x=cm, y=left, name="difference", line={"color": "#c0392b", "width": 1}, row=2, col=1)
-        figure.update_yaxes(title="difference / RMS [1]", row=2, col=1)
+        figure.update_yaxes(title="difference / RMS [1]", exponentformat="e", row=2, col=1)
     figure.add_scatter(
         x=cm, y=ours, name="reconstructed", line={"color": COLOURS["tracking"], "width": 1.2}, row=1, col=1
     )
     figure.update_yaxes(title="single-channel signal [counts]", row=1, col=1)
-    figure.update_xaxes(title="wavenumber [cm⁻¹]", autorange="reversed", row=2 if reference is not None else 1, col=1)
+    figure.update_xaxes(
+        title="wavenumber [cm⁻¹]",
+        autorange="reversed",
+        exponentformat="none",
+        row=2 if reference is not None else 1,
+        col=1,
+    )
     return layout(figure, 520)
 
 
