@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.campaign import Campaign, FlightKeys
 from pipeline.errors import InputError
 from pipeline.raster import Dem
-from pipeline.records import GNSS_QUALITIES, Chamber, Gnss, Imu
+from pipeline.records import DATA_GAP, GNSS_QUALITIES, Chamber, Gnss, Imu
 from tsmftis.geodesy import SEMI_MAJOR_AXIS
 
 TURN_S = 2.0  # over which courses and turns are compared
@@ -202,7 +202,7 @@ def _describe_chamber(part: str, chamber: Chamber, found: Inspection) -> None:
 def _describe_imu(part: str, imu: Imu, nominal: float, found: Inspection) -> None:
     step = np.diff(imu.time)
     rate = 1.0 / float(np.median(step))
-    gaps = int((step > 2.5 * np.median(step)).sum())
+    gaps = int((step > DATA_GAP * np.median(step)).sum())
     found.add(
         part,
         duration=f"{np.ptp(imu.time):.1f} s at {rate:.5g} Hz ({imu.time.size} samples)",
@@ -224,7 +224,7 @@ def _describe_gnss(part: str, gnss: Gnss, found: Inspection) -> None:
     shares = ", ".join(
         f"{(gnss.quality == q).mean():.0%} {name}" for q, name in GNSS_QUALITIES.items() if (gnss.quality == q).any()
     )
-    gaps = int((step > 2.5 * np.median(step)).sum())
+    gaps = int((step > DATA_GAP * np.median(step)).sum())
     found.add(
         part,
         duration=f"{np.ptp(gnss.time):.1f} s at {1 / np.median(step):.3g} Hz ({gnss.time.size} fixes)",

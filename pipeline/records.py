@@ -22,6 +22,7 @@ from tsmftis.interferometer import Interferometer
 
 Array = NDArray[np.float64]
 
+DATA_GAP = 2.5  # a step longer than this many usual ones is a gap in inertial data or fixes
 FRAME_DROP = 1.5  # an interval longer than this many usual ones means frames are missing
 GNSS_QUALITIES = {1: "fixed", 2: "float", 5: "single"}
 

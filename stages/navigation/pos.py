@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.stats import chi2
 
 from pipeline.errors import InputError
-from pipeline.records import Gnss, Imu, ThermalCorrection
+from pipeline.records import DATA_GAP, Gnss, Imu, ThermalCorrection
 from stages.navigation import kalman
 from stages.navigation.alignment import Start, align, starting_at
 from stages.navigation.output import NavigationResult, assemble, sigmas
@@ -21,8 +21,6 @@ from tsmftis.inertial import ImuModel
 from tsmftis.rotation import dcm_to_quaternion, dcm_to_rpy, exp_so3, rpy_jacobian, rpy_to_dcm
 
 Array = NDArray[np.float64]
-
-GAP_FACTOR = 2.5  # an interval longer than this many nominal ones is a gap in the data
 
 
 class NavigationSettings(BaseModel):
@@ -169,7 +167,7 @@ def _filter_and_smooth(
     n, nfix = imu.time.size, gnss.time.size
     steps = np.diff(imu.time, prepend=imu.time[0])
     nominal = float(np.median(steps[1:]))
-    gap = steps > GAP_FACTOR * nominal
+    gap = steps > DATA_GAP * nominal
     # Inside a gap the body moves as it does elsewhere: the data's own scatter, held over the gap, as white noise.
     longest = max(float(steps.max()), nominal)
     gap_noise = np.zeros(kalman.NSTATE)

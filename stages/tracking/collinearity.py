@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.interpolate import CubicHermiteSpline
 
 from pipeline.errors import InputError, StageError
-from pipeline.records import CameraPoses, Targets, Tracks, Trajectory
+from pipeline.records import DATA_GAP, CameraPoses, Targets, Tracks, Trajectory
 from tsmftis.camera import Camera, Mounting, camera_pose
 from tsmftis.geodesy import ecef_to_geodetic, geodetic_to_ecef, ned_to_ecef_dcm, radii_of_curvature
 from tsmftis.rotation import Attitude, rpy_to_dcm
@@ -86,8 +86,12 @@ def run(
 
 
 def camera_poses(trajectory: Trajectory, time: Array, mounting: Mounting) -> CameraPoses:
-    """The camera at times (n,) [s]; NaN where the trajectory does not reach."""
+    """The camera at times (n,) [s]; NaN where the trajectory does not reach, or has a gap in the inertial data."""
+    after = np.clip(np.searchsorted(trajectory.time, time), 1, trajectory.time.size - 1)
+    step = trajectory.time[after] - trajectory.time[after - 1]
     inside = (time >= trajectory.time[0]) & (time <= trajectory.time[-1])
+    # Nothing tells how the camera moved in a gap.
+    inside &= step <= DATA_GAP * np.median(np.diff(trajectory.time))
     centre, dcm = np.full((time.size, 3), np.nan), np.full((time.size, 3, 3), np.nan)
     if inside.sum() >= 1:
         part = trajectory.between(time[inside].min() - MARGIN_S, time[inside].max() + MARGIN_S)

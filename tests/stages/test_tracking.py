@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -170,3 +170,17 @@ def test_frames_beyond_the_trajectory_have_no_pose_and_none_at_all_is_an_error()
     swapped = replace(targets(), latitude=targets().longitude - 1.0, longitude=targets().latitude)
     with pytest.raises(InputError, match="km from the line"):
         run(trajectory(), STAMPS, swapped, CAMERA, MOUNTING, TrackingSettings())
+
+
+def test_frames_in_a_gap_of_the_inertial_data_have_no_pose() -> None:
+    """Nothing tells how the camera moved there; beside the gap the tracks are as without it, to what a spline's end costs."""
+    whole = trajectory()
+    kept = (whole.time < 2.0025) | (whole.time > 2.3025)
+    cut = Trajectory(**{f.name: getattr(whole, f.name)[kept] for f in fields(Trajectory)})
+    col = run(cut, STAMPS, targets(), CAMERA, MOUNTING, TrackingSettings()).tracks.col[1]
+    want = run(whole, STAMPS, targets(), CAMERA, MOUNTING, TrackingSettings()).tracks.col[1]
+    true = STAMPS - CAMERA.latency
+    lost = (true > 2.001) & (true < 2.299)
+    assert np.isnan(col[..., lost]).all() and np.isfinite(col[..., (true < 1.999) | (true > 2.306)]).all()
+    beside = (true < 1.9) | (true > 2.4)
+    np.testing.assert_allclose(col[..., beside], want[..., beside], atol=1e-3)
