@@ -30,6 +30,7 @@ def import_opus(
     """Write an OPUS file's interferogram, its parameters and the vendor's spectrum as a bench file of a campaign."""
     from pipeline.formats.opus import read_opus
 
+    _writable(out)
     bench = read_opus(file)
     _write(bench.to_dataset(), out)
     scans, samples = bench.interferogram.shape
@@ -55,6 +56,7 @@ def import_pos(
     """Write an RTKLIB solution as a gnss file of a campaign; the epoch that its times count from is printed."""
     from pipeline.formats.rtklib import read_pos
 
+    _writable(out)
     gnss, start = read_pos(file, epoch)
     _write(gnss.to_dataset(), out)
     Console(highlight=False, soft_wrap=True).print(
@@ -64,9 +66,12 @@ def import_pos(
     )
 
 
-def _write(dataset: xr.Dataset, out: Path) -> None:
+def _writable(out: Path) -> None:
     if out.is_dir() or not out.parent.is_dir():
         raise InputError(out, "OUT", "is not a file name in an existing folder", "give for instance bench/sample.nc")
+
+
+def _write(dataset: xr.Dataset, out: Path) -> None:
     temporary = out.with_name(out.name + ".tmp")
     write_dataset(dataset, temporary)
     os.replace(temporary, out)
