@@ -585,7 +585,7 @@ def test_what_cannot_be_solved_says_so_in_one_line() -> None:
 
 @needs("clean")
 def test_clean_within_the_bounds_of_its_truth() -> None:
-    """A POS must stay within 0.02 m, 0.003° and 0.01°; measured 1.4 mm, 0.0001°, 0.0003° although no thermal model is applied here."""
+    """Within 0.02 m, 0.003° and 0.01°; measured 1.4 mm, 0.0001°, 0.0003° although no thermal model is applied here."""
     campaign = read_campaign(SHARED / "clean")
     keys = campaign.flight("F1").initial
     assert keys is not None
