@@ -354,7 +354,7 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
                 campaign.calibration(),
                 camera,
                 interferometer,
-                settings,
+                int(spectra.attributes["drift_order"]),
             ):
                 cube.write(np.moveaxis(strip, 2, 0), window=Window(0, start, strip.shape[1], strip.shape[0]))
                 quicklook.add(start, strip)

@@ -11,6 +11,7 @@ Functions
 ---------
 apodization         the window family
 mertz_ramp          weights that count the doubly measured short side once
+scored_window       both, as the score is defined
 quadrature          dx of each sample
 remove_constant     DC and slow drift
 transform           S(σ)
@@ -47,6 +48,10 @@ BLACKMAN_HARRIS = {
     "blackman-harris-3": (0.42323, 0.49755, 0.07922),
     "blackman-harris-4": (0.35875, 0.48829, 0.14128, 0.01168),
 }
+# The score is defined on these; they are no settings.
+SCORED_APODIZATION = "connes"
+LEAST_SEEN = 0.97  # of the columns, for a point or a cell to have a spectrum
+
 APODIZATIONS = ("boxcar", "triangle", "connes", "happ-genzel", "gaussian", *NORTON_BEER, *BLACKMAN_HARRIS)
 
 
@@ -91,6 +96,11 @@ def mertz_ramp(opd: Array, short_side: float, centre: float = 0.0) -> Array:
     return np.clip(0.5 * (1.0 + direction * (opd - centre) / (short_side - abs(centre))), 0.0, 1.0)
 
 
+def scored_window(opd: Array, longest: float, short_side: float, centre: float) -> Array:
+    """The window of every scored spectrum and of the cube: Mertz ramp about `centre` times `SCORED_APODIZATION` of OPD/L."""
+    return mertz_ramp(opd, short_side, centre) * apodization(SCORED_APODIZATION, opd / longest)
+
+
 def quadrature(opd: Array) -> Array:
     """dx of each sample (..., n) by the trapezoid rule; the end samples stand for half an interval."""
     opd = np.asarray(opd, float)
@@ -130,8 +140,8 @@ def _by_series(weighted: Array, opd: Array, wavenumber: Array) -> Complex:
     """Σ_j v_j·exp(−2πiσx_j) for interferograms (m, n) that each have their own OPDs near common ones.
 
     With x_j = c_j + s + d_j, c the mean over the interferograms, s one shift each and d what is left, the factor
-    exp(−2πiσd) is expanded in powers of d, so that each order is one product with a table that all share. Samples whose d is
-    too large for that are few orders' worth of work at most: beyond 4 rad the sum is taken as it stands.
+    exp(−2πiσd) is expanded in powers of d, so that each order is one product with a table that all share. Where 2πσd goes
+    beyond 4 rad, which would want many orders, the sum is taken as it stands.
     """
     common = opd.mean(axis=0)
     shift = (opd - common).mean(axis=1, keepdims=True)

@@ -24,7 +24,6 @@ from tsmftis.interferometer import Interferometer
 Array = NDArray[np.float64]
 Heights = Callable[[Array, Array], Array]
 
-LEAST_SEEN = 0.97  # of the columns, for a cell to have a spectrum: the score's own rule
 EDGE_CELLS = 12  # kept beyond the ends of what the plane says is seen
 STRIP_VALUES = 1_500_000  # cells × columns worked off at a time
 BLOCK_FRAMES = 256  # frames in memory at a time
@@ -39,7 +38,6 @@ class MappingSettings(BaseModel):
     wavenumber_step_per_m: float = Field(10_000.0, gt=0, description="spacing of the bands")
     cell_m: float | None = Field(None, gt=0, description="side of a cell; default one nominal ground sample")
     crs: str | None = Field(None, description="a projected CRS in metres; default: the UTM zone of the line")
-    drift_order: int = Field(1, ge=0, le=4, description="polynomial in OPD taken off each interferogram")
 
     @field_validator("crs")
     @classmethod
@@ -135,11 +133,12 @@ def run(
     calibration: Calibration,
     camera: Camera,
     interferometer: Interferometer,
-    settings: MappingSettings,
+    drift_order: int,
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     """Yield (first row of cells, radiance (rows, across, wavenumber)) strip by strip; NaN where a cell is not seen.
 
-    heights(latitude, longitude) [rad] → [m]; phase (k,) [rad] on wavenumber (k,) [m-1], as the line's spectra have it.
+    heights(latitude, longitude) [rad] → [m]; phase (k,) [rad] on wavenumber (k,) [m-1] and
+    drift_order as the line's spectra have them.
     """
     response = np.interp(wavenumber, calibration.wavenumber, calibration.response)
     window_of = _windower(interferometer, fourier.fringe_centre(phase, wavenumber))
@@ -152,13 +151,13 @@ def run(
         points = geodetic_to_ecef(latitude, longitude, heights(latitude, longitude)).reshape(-1, 3)
         value, weight, row = _extract(points, frames, poses, calibration, camera, interferometer)
         seen = weight > 0
-        good = np.flatnonzero(seen.mean(axis=1) >= LEAST_SEEN)
+        good = np.flatnonzero(seen.mean(axis=1) >= fourier.LEAST_SEEN)
         radiance = np.full((len(points), wavenumber.size), np.nan, np.float32)
         if good.size:
             once = np.maximum(weight[good], 1.0)
             filled = extraction.fill_gaps(value[good] / once, seen[good])
             opd, window = window_of(extraction.fill_gaps(row[good] / once, seen[good]))
-            ac = fourier.remove_constant(filled, opd, settings.drift_order)
+            ac = fourier.remove_constant(filled, opd, drift_order)
             radiance[good] = fourier.radiance(ac, opd, window, wavenumber, phase, response)[0]
         yield start, radiance.reshape(stop - start, grid.shape[1], wavenumber.size)
 
@@ -204,8 +203,7 @@ def _windower(interferometer: Interferometer, centre: float) -> Callable[[Array]
     """rows (cell, col) → OPD and window, one for all cells where rows do not matter."""
 
     def window(opd: Array) -> Array:
-        ramp = fourier.mertz_ramp(opd, interferometer.shortest_side, centre)
-        return ramp * fourier.apodization("connes", opd / interferometer.longest_opd)
+        return fourier.scored_window(opd, interferometer.longest_opd, interferometer.shortest_side, centre)
 
     columns = np.arange(interferometer.cols)
     if interferometer.fringe_tilt == 0.0:

@@ -16,9 +16,6 @@ from tsmftis.interferometer import Interferometer
 
 Array = NDArray[np.float64]
 
-# The score is defined on these; they are no settings.
-APODIZATION = "connes"
-LEAST_SEEN = 0.97  # of the columns, for a point to count
 LEAST_POINTS = 5  # of the 25, for an area to count
 
 
@@ -64,7 +61,7 @@ def run(
     wavenumber = interferometer.scored_wavenumbers()
     response = np.interp(wavenumber, calibration.wavenumber, calibration.response)
     leading = tracks.methods.index("tracking") if "tracking" in tracks.methods else len(tracks.methods) - 1
-    counted = ifg.seen >= LEAST_SEEN
+    counted = ifg.seen >= fourier.LEAST_SEEN
     if not counted[leading].any():
         raise StageError(
             "no target crosses enough columns of the detector: the line is too short or the targets lie off its track"
@@ -79,9 +76,7 @@ def run(
 
     phi = fourier.smooth_phase(phase, wavenumber)
     centre_opd = fourier.fringe_centre(phi, wavenumber)
-    window = fourier.mertz_ramp(opd, interferometer.shortest_side, centre_opd) * fourier.apodization(
-        APODIZATION, opd / interferometer.longest_opd
-    )
+    window = fourier.scored_window(opd, interferometer.longest_opd, interferometer.shortest_side, centre_opd)
     value, sigma = fourier.radiance(ac, opd, window, wavenumber, phi, response, variance * ifg.gain)
     value[~counted], sigma[~counted] = np.nan, np.nan
     breaks = [start for start, _ in frames.segments()[1:]]
@@ -99,7 +94,7 @@ def run(
         counted.sum(axis=2),
         phase,
         {
-            "apodization": APODIZATION,
+            "apodization": fourier.SCORED_APODIZATION,
             "phase_method": "Mertz, one polynomial for the line",
             "drift_order": settings.drift_order,
             "read_variance_dn2": read_variance,
@@ -152,7 +147,7 @@ def instrument_phase(ac: Array, opd: Array, interferometer: Interferometer, wave
     coefficients, centre = np.zeros(order + 1), 0.0
     # The window must lie about the fringes' centre, which the phase itself tells: twice more is enough.
     for _ in range(3):
-        window = fourier.apodization(APODIZATION, (opd - centre) / (short - abs(centre)))
+        window = fourier.apodization(fourier.SCORED_APODIZATION, (opd - centre) / (short - abs(centre)))
         mean = fourier.transform(ac, opd, window, wavenumber).sum(axis=0)
         coefficients = fourier.phase_polynomial(mean, wavenumber, order)
         centre = fourier.fringe_centre(fourier.smooth_phase(coefficients, wavenumber), wavenumber)
@@ -234,6 +229,11 @@ def scored_references(
                 calibration.wavenumber, references.wavenumber, references.radiance[references.names.index(name)]
             )
             out[i] = fourier.line_shape_response(
-                table, calibration.response, calibration.wavenumber, interferometer.longest_opd, APODIZATION, wavenumber
+                table,
+                calibration.response,
+                calibration.wavenumber,
+                interferometer.longest_opd,
+                fourier.SCORED_APODIZATION,
+                wavenumber,
             )
     return out

@@ -73,9 +73,9 @@ def flat(latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
 def cube(tilt: float, grid: MapGrid, wavenumber: np.ndarray, phase: np.ndarray) -> np.ndarray:
     out = np.full((*grid.shape, wavenumber.size), -1.0, np.float32)
     raw, calibration = frames(tilt)
-    settings = MappingSettings()
+    drift_order = ReconstructionSettings().drift_order
     for start, part in run(
-        raw, poses(), flat, grid, wavenumber, phase, calibration, CAMERA, interferometer(tilt), settings
+        raw, poses(), flat, grid, wavenumber, phase, calibration, CAMERA, interferometer(tilt), drift_order
     ):
         out[start : start + len(part)] = part
     return out
