@@ -339,7 +339,7 @@ def test_a_cached_run_gives_the_same_bytes(demo: Path, demo_run: Path, again: Pa
 @pytest.mark.parametrize(
     ("setting", "least", "most"),
     [
-        ("mapping.drift_order=2", {"mapping"}, {"mapping"}),
+        ("mapping.wavenumber_step_per_m=20000", {"mapping"}, {"mapping"}),
         ("reconstruction.phase_order=3", {"reconstruction"}, {"reconstruction", "mapping", "scoring"}),
         ("registration.corners=300", {"registration"}, {"registration", "reconstruction", "mapping", "scoring"}),
         ("navigation.epoch_s=0.05", {"navigation", "tracking"}, set(STAGES[1:7])),
