@@ -3,8 +3,9 @@
 Functions
 ---------
 starting_at     a known attitude, position and velocity from the nearest fix
-align           self-alignment: in motion (levelling by GNSS acceleration, heading by GNSS course) or from rest (levelling at
-                standstill, heading by the course once the vehicle moves, carried back by the gyros)
+align           self-alignment: at rest by gyrocompassing (levelling by gravity, heading by the Earth's rotation), in motion
+                (levelling by GNSS acceleration, heading by GNSS course), or from rest (levelling at standstill, heading by the
+                course once the vehicle moves, carried back by the gyros)
 
 References
 ----------
@@ -21,10 +22,16 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu
 from stages.navigation.mechanisation import turn
-from tsmftis.geodesy import normal_gravity, radii_of_curvature
+from stages.navigation.standstill import Standstill
+from stages.navigation.velocity import gnss_velocity
+from tsmftis.geodesy import EARTH_RATE, normal_gravity, radii_of_curvature
+from tsmftis.inertial import SensorModel
 from tsmftis.rotation import dcm_to_quaternion, dcm_to_rpy, quaternion_to_dcm, rpy_to_dcm
 
 Array = NDArray[np.float64]
+
+COMPASS_WINDOWS = 20  # s: least standstill for a gyrocompass
+COMPASS_LONGEST = 300.0  # s: beyond it, biases wander
 
 
 @dataclass(frozen=True)
@@ -39,19 +46,6 @@ class Start:
     sigma_velocity: Array
     sigma_rpy: Array
     method: str
-
-
-def gnss_velocity(gnss: Gnss) -> tuple[Array, Array]:
-    """The receiver's velocity NED and its sigmas (n, 3) [m/s]; differences of positions where it gives none.
-
-    A central difference over 2Δt of fixes with sigma σ has sigma σ·√2/(2Δt).
-    """
-    if gnss.velocity is not None and gnss.sigma_velocity is not None:
-        return gnss.velocity, gnss.sigma_velocity
-    north, east = radii_of_curvature(gnss.latitude)
-    rate = np.stack([np.gradient(v, gnss.time) for v in (gnss.latitude, gnss.longitude, gnss.height)], 1)
-    scale = np.stack([north + gnss.height, (east + gnss.height) * np.cos(gnss.latitude), -np.ones(gnss.time.size)], 1)
-    return rate * scale, gnss.sigma_position / np.sqrt(2.0) / np.gradient(gnss.time)[:, None]
 
 
 def starting_at(time: float, rpy: Array, sigma_rpy: Array, gnss: Gnss, lever: Array, method: str) -> Start:
@@ -92,18 +86,25 @@ def level(force_body: Array, force_ned: Array, yaw: float) -> tuple[float, float
     return float(roll), float((pitch + np.pi) % (2 * np.pi) - np.pi)
 
 
-def align(imu: Imu, gnss: Gnss, lever: Array, course_speed: float) -> Start:
-    """Self-alignment: in motion where the first fixes move faster than `course_speed` [m/s], else from rest.
+def align(
+    imu: Imu, gnss: Gnss, lever: Array, gyro: SensorModel, still: Standstill, course_speed: float, offset: float = 0.0
+) -> Start:
+    """Self-alignment: from rest by gyrocompassing where the gyros are good enough for it; else in motion where the first fixes
+    move faster than `course_speed` [m/s], or from rest by the later course.
 
-    The heading is the GNSS course (no crab angle: sigma 10° in motion, 20° from rest); the flight's own accelerations
-    refine it, and the filter is run again from the smoothed start. A speed counts only beyond five of its sigmas, so that the
-    scatter of a parked receiver is no course. Raises InputError where the unit never moves fast enough for a course.
+    The heading is the GNSS course turned by `offset` [rad] (no crab angle: sigma 10° in motion, 20° from rest); the flight's
+    own accelerations refine it, and the filter is run again from the smoothed start. A speed counts only beyond five of its
+    sigmas, so that the scatter of a parked receiver is no course. Raises InputError where the unit never moves fast enough for a
+    course and is too coarse for a gyrocompass.
     """
     velocity, sigma = gnss_velocity(gnss)
     start = max(float(imu.time[0]), float(gnss.time[0]) - 1.0)
     inside = (gnss.time >= start) & (gnss.time <= imu.time[-1])
     speed, doubt = np.hypot(velocity[:, 0], velocity[:, 1]), 5.0 * np.hypot(sigma[:, 0], sigma[:, 1])
     moving = np.flatnonzero(inside & (speed > np.maximum(course_speed, doubt)))
+    compass = _gyrocompass(imu, gnss, still, lever, gyro, float(gnss.time[moving[0]]) if moving.size else np.inf)
+    if compass is not None:
+        return compass
     if moving.size == 0:
         raise InputError(
             "gnss",
@@ -112,8 +113,39 @@ def align(imu: Imu, gnss: Gnss, lever: Array, course_speed: float) -> Start:
             "give flights[].initial in campaign.yaml or lower navigation.course_speed_m_per_s",
         )
     if gnss.time[moving[0]] - start < 2.0:
-        return _in_motion(imu, gnss, velocity, int(moving[0]), lever)
-    return _from_rest(imu, gnss, velocity, moving, start, lever)
+        return _in_motion(imu, gnss, velocity, int(moving[0]), lever, offset)
+    return _from_rest(imu, gnss, velocity, moving, start, lever, offset)
+
+
+def _gyrocompass(
+    imu: Imu, gnss: Gnss, still: Standstill, lever: Array, gyro: SensorModel, moves: float
+) -> Start | None:
+    """Levelling by gravity and heading by the Earth's rotation over the first unbroken standstill, before `moves` [s].
+
+    With the rate levelled, (ω_x, ω_y) = Ω·cos L·(cos yaw, −sin yaw). σ_yaw = √(σ_b² + N²/T)/(Ω·cos L); None where that exceeds
+    5°: consumer and tactical gyros.
+    """
+    if still.start.size < COMPASS_WINDOWS:
+        return None
+    breaks = np.flatnonzero(np.diff(still.start) > 1.5 * (still.stop[0] - still.start[0]))
+    last = int(breaks[0]) if breaks.size else still.start.size - 1
+    first = still.start[0]
+    stop = min(float(still.stop[last]), moves, float(first) + COMPASS_LONGEST)
+    if stop - first < COMPASS_WINDOWS:
+        return None
+    latitude = float(gnss.latitude[np.argmin(np.abs(gnss.time - first))])
+    across = EARTH_RATE * np.cos(latitude)
+    sigma_yaw = float(np.sqrt(gyro.bias_sigma**2 + gyro.white_noise**2 / (stop - first)) / across)
+    if sigma_yaw > np.deg2rad(5.0):
+        return None
+    force, rate = (_mean_over(imu, values, first, stop) for values in (imu.accel, imu.gyro))
+    roll, pitch = level(force, np.array([0.0, 0.0, -np.linalg.norm(force)]), 0.0)
+    if abs(np.linalg.norm(rate) - EARTH_RATE) > 5.0 * sigma_yaw * across:
+        return None  # it turned, or the gyros are worse than declared
+    north, east, _ = rpy_to_dcm(roll, pitch, 0.0) @ rate
+    rpy = np.array([roll, pitch, np.arctan2(-east, north)])
+    sigma = np.array([np.deg2rad(0.5), np.deg2rad(0.5), 2.0 * sigma_yaw])
+    return starting_at(float(first), rpy, sigma, gnss, lever, "from rest: levelling and gyrocompassing")
 
 
 def _mean_over(imu: Imu, values: Array, start: float, stop: float) -> Array:
@@ -128,9 +160,9 @@ def _mean_over(imu: Imu, values: Array, start: float, stop: float) -> Array:
     return np.asarray(values[inside].mean(axis=0))
 
 
-def _in_motion(imu: Imu, gnss: Gnss, velocity: Array, first: int, lever: Array) -> Start:
+def _in_motion(imu: Imu, gnss: Gnss, velocity: Array, first: int, lever: Array, offset: float) -> Start:
     time = float(max(gnss.time[first], imu.time[0]))
-    yaw = float(np.arctan2(velocity[first, 1], velocity[first, 0]))
+    yaw = float(np.arctan2(velocity[first, 1], velocity[first, 0])) + offset
     last = min(int(np.searchsorted(gnss.time, time + 1.0)), gnss.time.size - 1)
     acceleration = (velocity[last] - velocity[first]) / max(gnss.time[last] - gnss.time[first], 1e-3)
     gravity = float(normal_gravity(gnss.latitude[first], gnss.height[first]))
@@ -140,7 +172,9 @@ def _in_motion(imu: Imu, gnss: Gnss, velocity: Array, first: int, lever: Array) 
     return starting_at(time, np.array([roll, pitch, yaw]), np.deg2rad([3.0, 3.0, 10.0]), gnss, lever, method)
 
 
-def _from_rest(imu: Imu, gnss: Gnss, velocity: Array, moving: NDArray[np.int64], start: float, lever: Array) -> Start:
+def _from_rest(
+    imu: Imu, gnss: Gnss, velocity: Array, moving: NDArray[np.int64], start: float, lever: Array, offset: float
+) -> Start:
     rest = min(5.0, gnss.time[moving[0]] - start - 1.0)
     force = _mean_over(imu, imu.accel, start, start + rest)
     roll, pitch = level(force, np.array([0.0, 0.0, -np.linalg.norm(force)]), 0.0)
@@ -153,6 +187,6 @@ def _from_rest(imu: Imu, gnss: Gnss, velocity: Array, moving: NDArray[np.int64],
     at = np.searchsorted(imu.time[span], gnss.time[fixes], side="right") - 1
     _, _, heading = dcm_to_rpy(quaternion_to_dcm(turned[at]))
     course = np.arctan2(velocity[fixes, 1], velocity[fixes, 0])
-    yaw = float(np.angle(np.mean(np.exp(1j * (course - heading)))))
+    yaw = float(np.angle(np.mean(np.exp(1j * (course - heading))))) + offset
     method = "from rest: levelling, then GNSS course"
     return starting_at(start, np.array([roll, pitch, yaw]), np.deg2rad([2.0, 2.0, 20.0]), gnss, lever, method)

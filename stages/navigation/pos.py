@@ -2,42 +2,46 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import chi2
 
 from pipeline.errors import InputError
-from pipeline.records import DATA_GAP, Gnss, Imu, ThermalCorrection
-from stages.navigation import kalman
+from pipeline.records import Gnss, Imu, ThermalCorrection, Trajectory
+from stages.navigation import output, quality, states
 from stages.navigation.alignment import Start, align, starting_at
-from stages.navigation.output import NavigationResult, assemble, sigmas
+from stages.navigation.settings import NavigationSettings
+from stages.navigation.solve import Problem, Solution, likelihood, solve
+from stages.navigation.standstill import Standstill, find
+from stages.navigation.velocity import gnss_velocity
 from tsmftis.camera import Mounting
 from tsmftis.geodesy import radii_of_curvature
 from tsmftis.inertial import ImuModel
-from tsmftis.rotation import dcm_to_quaternion, dcm_to_rpy, exp_so3, rpy_jacobian, rpy_to_dcm
+from tsmftis.rotation import dcm_to_rpy, exp_so3, quaternion_to_dcm, rpy_to_dcm
 
 Array = NDArray[np.float64]
 
+UNSURE_HEADING = np.deg2rad(9.0)  # a start that knows its heading worse than this is tried on several
+HEADINGS = np.deg2rad([0.0, 45.0, -45.0, 90.0, -90.0, 135.0, -135.0, 180.0])
+HEADING_SIGMA = np.deg2rad(20.0)  # of each of them
+TRIAL_S = 120.0  # of flight that a heading is tried on
+COURSE_SIGMA = np.deg2rad(40.0)  # how far a vehicle's heading may be from its course, where nothing else tells
+SETTLED = np.deg2rad(0.5)  # a smoothed correction of the first attitude below this needs no further pass
+SETTLED_LATENCY = 1e-3  # s
 
-class NavigationSettings(BaseModel):
-    """How the filter is run; the sensors' own figures come from instrument.yaml."""
+Effects = Mapping[str, Mapping[str, float]]
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
-    epoch_s: float = Field(0.2, gt=0, le=1.0, description="longest step of the covariance")
-    gate_probability: float = Field(1e-6, gt=0, lt=0.1, description="chance that a good fix is rejected")
-    reentry_s: float = Field(
-        5.0, gt=0, description="without an accepted fix for so long, fixes are weighed down instead of rejected"
-    )
-    course_speed_m_per_s: float = Field(
-        1.0, gt=0, description="least speed whose course is taken for the heading when the pipeline aligns itself"
-    )
-    use_gnss_velocity: bool = Field(True, description="use the fixes' velocities besides their positions")
-    passes: int = Field(3, ge=1, le=6, description="most filter passes when the first attitude was poor")
+@dataclass(frozen=True)
+class NavigationResult:
+    """The trajectory at IMU rate and what a person must know to trust it (`quality`: plain data for run.json and the report)."""
+
+    trajectory: Trajectory
+    quality: dict[str, Any]
+    figures: dict[str, list[float]]
 
 
 def run(
@@ -49,39 +53,35 @@ def run(
     *,
     initial: tuple[float, Array, Array] | None = None,
     correction: ThermalCorrection | None = None,
+    effects: Effects | None = None,
 ) -> NavigationResult:
     """Integrate one flight.
 
     `initial` is (time [s], rpy [rad], sigma_rpy [rad]) or None (self-alignment); `correction` is taken off the inertial
-    data in the IMU's own axes before they are turned into the body. Raises InputError where IMU and GNSS do not overlap.
+    data in the IMU's own axes before they are turned into the body. `effects` are what a model update adds to the declared
+    model, by the contract's names ({"gnss_latency": {"latency": 0.04}}). Raises InputError where IMU and GNSS do not overlap,
+    where the inertial data have a gap that nothing can bridge, or where the two clocks part.
     """
     imu = in_body_axes(imu, mounting, correction)
-    lever = mounting.imu_to_antenna
-    overlap = (gnss.time >= imu.time[0]) & (gnss.time <= imu.time[-1])
-    if overlap.sum() < 5:
-        raise InputError(
-            "gnss",
-            "variable 'time'",
-            f"spans {gnss.time[0]:.1f} to {gnss.time[-1]:.1f} s and the IMU {imu.time[0]:.1f} to {imu.time[-1]:.1f} s, "
-            f"so {int(overlap.sum())} fixes overlap",
-            "both must be seconds on the campaign's one clock",
-        )
-    start = _start(imu, gnss, lever, settings, initial)
-    used_imu = _from(imu, start.time)
-    solution: dict[str, Any] = {}
-    for number in range(settings.passes):
-        solution.clear()  # the last pass's matrices make room for this one's
-        solution = _filter_and_smooth(used_imu, gnss, model, lever, settings, start)
-        shift = solution["correction"][0]
-        if np.linalg.norm(shift[kalman.ATTITUDE]) < np.deg2rad(0.5) or number == settings.passes - 1:
-            break
-        # The first attitude was poor, so the filter linearised about a poor path: start again from the smoothed one. The
-        # prior of position, velocity and attitude moves with it and keeps its width, which is nothing beside the flight's own
-        # information; that of the sensors' errors stays where it was, since it does count.
-        start = _shifted(start, shift)
-    for finished in ("epoch_P", "epoch_phi", "H", "K", "S_inv"):
-        del solution[finished]
-    return assemble(used_imu, gnss, solution, start, number + 1)
+    theta = declared(mounting, effects or {})
+    _overlap(imu, gnss)
+    _bridgeable(imu, settings)
+    lever = theta[states.parameter("antenna_lever_arm")]
+    late = float(theta[states.parameter("gnss_latency")][0])
+    kept = _unless(gnss, quality.withheld_fixes(gnss, settings))
+    shifted = replace(kept, time=kept.time - late)
+    still = find(imu, shifted, model.gyro.white_noise) if settings.standstill_updates else Standstill.none()
+    start = _start(imu, shifted, lever, model, still, settings, initial)
+    used = _from(imu, start.time)
+    problem = Problem(used, gnss, model, settings, still.after(start.time), start, theta, late)
+    problem = _surest_heading(problem, imu, shifted, lever, model, still, settings, initial)
+    solution, passes = _repeated(problem)
+    histories = quality.histories(solution)
+    # What is left needs none of the matrices, which are most of a long flight's memory.
+    solution = replace(solution, store=quality.without_matrices(solution.store))
+    trajectory = output.trajectory(solution)
+    figures_of_merit, figures = quality.assess(solution, trajectory, histories, start, passes)
+    return NavigationResult(trajectory, figures_of_merit, figures)
 
 
 def in_body_axes(imu: Imu, mounting: Mounting, correction: ThermalCorrection | None) -> Imu:
@@ -97,11 +97,61 @@ def in_body_axes(imu: Imu, mounting: Mounting, correction: ThermalCorrection | N
     return Imu(imu.time, gyro, accel)
 
 
+def declared(mounting: Mounting, effects: Effects) -> Array:
+    """The parameters θ (19,) as declared: the lever arm, and what a model update adds to it, to the stamps and to the sensors."""
+    theta = np.zeros(states.PARAMETERS)
+    theta[states.parameter("antenna_lever_arm")] = mounting.imu_to_antenna
+    for name, values in effects.items():
+        theta[states.parameter(name)] += [values[key] for key in ("x", "y", "z", "latency") if key in values]
+    return theta
+
+
+def _overlap(imu: Imu, gnss: Gnss) -> None:
+    inside = int(((gnss.time >= imu.time[0]) & (gnss.time <= imu.time[-1])).sum())
+    if inside < 5:
+        raise InputError(
+            "gnss",
+            "variable 'time'",
+            f"spans {gnss.time[0]:.1f} to {gnss.time[-1]:.1f} s and the IMU {imu.time[0]:.1f} to {imu.time[-1]:.1f} s, "
+            f"so {inside} fixes overlap",
+            "both must be seconds on the campaign's one clock",
+        )
+
+
+def _bridgeable(imu: Imu, settings: NavigationSettings) -> None:
+    steps = np.diff(imu.time)
+    longest = int(np.argmax(steps))
+    if steps[longest] > settings.longest_imu_gap_s:
+        raise InputError(
+            "imu",
+            "variable 'time'",
+            f"has a gap of {steps[longest]:.2f} s after {imu.time[longest]:.2f} s, in which nothing tells how the body moved",
+            "make two flights of it, or raise navigation.longest_imu_gap_s",
+        )
+
+
+def _unless(gnss: Gnss, without: NDArray[np.bool_]) -> Gnss:
+    """The fixes that are not `without`; alignment must not see what is withheld from the filter."""
+    kept = ~without
+    columns = (getattr(gnss, name) for name in gnss.__dataclass_fields__)
+    return Gnss(*(None if c is None else c[kept] for c in columns))  # type: ignore[arg-type]
+
+
 def _start(
-    imu: Imu, gnss: Gnss, lever: Array, settings: NavigationSettings, initial: tuple[float, Array, Array] | None
+    imu: Imu,
+    gnss: Gnss,
+    lever: Array,
+    model: ImuModel,
+    still: Standstill,
+    settings: NavigationSettings,
+    initial: tuple[float, Array, Array] | None,
+    offset: float = 0.0,
 ) -> Start:
+    """The start, its heading turned by `offset` [rad] from what the course or `initial` says."""
+    if gnss.time.size < 2:
+        raise InputError("gnss", "variable 'time'", "has no fix that is not withheld", "withhold fewer")
     if initial is None:
-        return align(imu, gnss, lever, settings.course_speed_m_per_s)
+        return align(imu, gnss, lever, model.gyro, still, settings.course_speed_m_per_s, offset)
     time, rpy, sigma = initial
     if not imu.time[0] - 1.0 <= time < imu.time[-1]:
         raise InputError(
@@ -110,7 +160,68 @@ def _start(
             f"{time:g} s lies outside the IMU's {imu.time[0]:.2f} to {imu.time[-1]:.2f} s",
             "give a time inside the flight, or leave `initial` out",
         )
+    rpy = rpy + np.array([0.0, 0.0, offset])
     return starting_at(max(time, float(imu.time[0])), rpy, sigma, gnss, lever, "given")
+
+
+def _surest_heading(
+    problem: Problem,
+    imu: Imu,
+    gnss: Gnss,
+    lever: Array,
+    model: ImuModel,
+    still: Standstill,
+    settings: NavigationSettings,
+    initial: tuple[float, Array, Array] | None,
+) -> Problem:
+    """The problem with the start whose heading explains the first fixes best, where the heading is not known to 9°.
+
+    The filter alone is run from eight headings over the first two minutes in motion; the likelihood of the fixes decides, with
+    what is known beforehand (`initial`, or that vehicles mostly head where they go).
+    """
+    start = problem.start
+    if start.sigma_rpy[2] < UNSURE_HEADING:
+        return problem
+    known = float(start.sigma_rpy[2]) if initial is not None else COURSE_SIGMA
+    velocity, _ = gnss_velocity(gnss)
+    fast = (np.hypot(velocity[:, 0], velocity[:, 1]) > settings.course_speed_m_per_s) & (gnss.time >= start.time)
+    until = float(gnss.time[np.argmax(fast)] if fast.any() else start.time) + TRIAL_S
+    best, highest = problem, -np.inf
+    for offset in HEADINGS:
+        candidate = _start(imu, gnss, lever, model, still, settings, initial, float(offset))
+        candidate = replace(candidate, sigma_rpy=np.array([*candidate.sigma_rpy[:2], HEADING_SIGMA]))
+        trial = replace(problem, start=candidate)
+        value = likelihood(trial, until) - 0.5 * (offset / known) ** 2
+        if value > highest:
+            best, highest = trial, value
+    if best.start.rpy[2] != start.rpy[2]:
+        turned = np.rad2deg((best.start.rpy[2] - start.rpy[2] + np.pi) % (2 * np.pi) - np.pi)
+        return replace(
+            best, start=replace(best.start, method=f"{start.method}; turned by {turned:.0f}° to fit the fixes")
+        )
+    return replace(best, start=replace(best.start, sigma_rpy=np.maximum(start.sigma_rpy, best.start.sigma_rpy)))
+
+
+def _repeated(problem: Problem) -> tuple[Solution, int]:
+    """Passes until the path that the filter linearises about is the smoothed one: attitude, latency, and what a gap hides."""
+    settings = problem.settings
+    estimates_latency = "gnss_latency" in settings.estimate
+    number = 1
+    while True:
+        solution = solve(problem)
+        quality.refuse_clock_jump(solution)
+        attitude = np.linalg.norm(solution.shift(slice(0, 1))[0, states.ATTITUDE])
+        late = float(solution.theta()[-1, states.parameter("gnss_latency")][0]) if estimates_latency else 0.0
+        rough = attitude >= SETTLED or abs(late) > SETTLED_LATENCY
+        if number == settings.passes or not (rough or (number == 1 and solution.gap.any())):
+            return solution, number
+        # The prior of position, velocity and attitude moves with the start and keeps its width, which is nothing beside the
+        # flight's own information; that of the parameters stays where it was, since it does count.
+        start = _shifted(problem.start, solution.shift(slice(0, 1))[0]) if attitude >= SETTLED else problem.start
+        imu = _bridged(solution) if solution.gap.any() else problem.imu
+        problem = replace(problem, start=start, imu=imu, latency=problem.latency + late)
+        del solution  # its matrices make room for the next pass'
+        number += 1
 
 
 def _from(imu: Imu, time: float) -> Imu:
@@ -131,94 +242,27 @@ def _shifted(start: Start, shift: Array) -> Start:
     scale = np.array([north + start.position[2], (east + start.position[2]) * np.cos(start.position[0]), -1.0])
     return replace(
         start,
-        position=start.position + shift[kalman.POSITION] / scale,
-        velocity=start.velocity + shift[kalman.VELOCITY],
-        rpy=np.array(dcm_to_rpy(exp_so3(shift[kalman.ATTITUDE]) @ rpy_to_dcm(*start.rpy))),
+        position=start.position + shift[states.POSITION] / scale,
+        velocity=start.velocity + shift[states.VELOCITY],
+        rpy=np.array(dcm_to_rpy(exp_so3(shift[states.ATTITUDE]) @ rpy_to_dcm(*start.rpy))),
     )
 
 
-def _initial_covariance(start: Start, model: ImuModel) -> Array:
-    variance = np.zeros(kalman.NSTATE)
-    variance[kalman.POSITION], variance[kalman.VELOCITY] = start.sigma_position**2, start.sigma_velocity**2
-    variance[kalman.GYRO_BIAS], variance[kalman.ACCEL_BIAS] = model.gyro.bias_sigma**2, model.accel.bias_sigma**2
-    variance[kalman.GYRO_SCALE], variance[kalman.ACCEL_SCALE] = (
-        model.gyro.scale_factor_sigma**2,
-        model.accel.scale_factor_sigma**2,
-    )
-    P = np.diag(variance)
-    # Sigmas of roll, pitch, yaw into the NED rotation vector: φ = M·δrpy, the inverse of `rpy_jacobian`.
-    to_ned = np.linalg.inv(rpy_jacobian(start.rpy[None])[0])
-    P[kalman.ATTITUDE, kalman.ATTITUDE] = to_ned @ np.diag(start.sigma_rpy**2) @ to_ned.T
-    return P
+def _bridged(solution: Solution) -> Imu:
+    """The inertial data with what a gap hid put in: the constant rate and force that join the smoothed path before and after.
 
-
-def _process_noise(model: ImuModel) -> Array:
-    """Spectral densities [unit²/s] of the 21 states: white noise into v and φ, 2σ²/τ into the Gauss–Markov biases."""
-    noise = np.zeros(kalman.NSTATE)
-    noise[kalman.VELOCITY], noise[kalman.ATTITUDE] = model.accel.white_noise**2, model.gyro.white_noise**2
-    noise[kalman.GYRO_BIAS] = 2.0 * model.gyro.bias_sigma**2 / model.gyro.bias_correlation_time
-    noise[kalman.ACCEL_BIAS] = 2.0 * model.accel.bias_sigma**2 / model.accel.bias_correlation_time
-    return noise
-
-
-def _filter_and_smooth(
-    imu: Imu, gnss: Gnss, model: ImuModel, lever: Array, settings: NavigationSettings, start: Start
-) -> dict[str, Any]:
-    n, nfix = imu.time.size, gnss.time.size
-    steps = np.diff(imu.time, prepend=imu.time[0])
-    nominal = float(np.median(steps[1:]))
-    gap = steps > DATA_GAP * nominal
-    # Inside a gap the body moves as it does elsewhere: the data's own scatter, held over the gap, as white noise.
-    longest = max(float(steps.max()), nominal)
-    gap_noise = np.zeros(kalman.NSTATE)
-    gap_noise[kalman.ATTITUDE] = imu.gyro.var(axis=0).max() * longest
-    gap_noise[kalman.VELOCITY] = imu.accel.var(axis=0).max() * longest
-
-    with_velocity = gnss.velocity is not None and gnss.sigma_velocity is not None and settings.use_gnss_velocity
-    velocity = gnss.velocity if with_velocity else np.zeros((nfix, 3))
-    variance = (
-        np.concatenate([gnss.sigma_position, gnss.sigma_velocity if with_velocity else np.ones((nfix, 3))], 1) ** 2
-    )
-    fix_size = np.full(nfix, 6 if with_velocity else 3, np.int64)
-    middle = imu.time[1:] - 0.5 * steps[1:]
-    fix_rate = np.stack([np.interp(gnss.time, middle, imu.gyro[1:, i]) for i in range(3)], 1)
-    gates = np.array([0.0] + [chi2.isf(settings.gate_probability, m) for m in range(1, 7)])
-
-    size = nfix + int(np.ceil((imu.time[-1] - imu.time[0]) / settings.epoch_s)) + 2 * int(gap.sum()) + 2
-    store = kalman.Store.empty(n, size, nfix)
-    tau = np.repeat([model.gyro.bias_correlation_time, model.accel.bias_correlation_time], 3)
-    fixes = kalman.Fixes(
-        gnss.time, np.stack([gnss.latitude, gnss.longitude, gnss.height], 1), velocity, variance, fix_rate, fix_size
-    )
-    count = kalman.forward(
-        imu.time,
-        imu.gyro,
-        imu.accel,
-        gap,
-        fixes,
-        lever,
-        start.position.copy(),
-        start.velocity.copy(),
-        dcm_to_quaternion(rpy_to_dcm(*start.rpy)),
-        np.zeros(12),
-        _initial_covariance(start, model),
-        _process_noise(model),
-        gap_noise,
-        1.0 / tau,
-        settings.epoch_s,
-        gates,
-        settings.reentry_s,
-        store,
-    )
-    correction, smoothed = np.zeros((count, kalman.NSTATE)), np.empty((count, 9, 9))
-    kalman.backward(count, fix_size, store, correction, smoothed)
-    return store._asdict() | {
-        "count": count,
-        "correction": correction,
-        "smoothed_P": smoothed,
-        "sigma": sigmas(smoothed, store.epoch_dcm[:count]),
-        "gap": gap,
-        "fix_size": fix_size,
-        "variance": variance,
-        "lever": lever,
-    }
+    The noise that the gap adds stays; but the filter no longer linearises about a path that is degrees off behind it.
+    """
+    imu, store = solution.problem.imu, solution.store
+    gyro, accel = imu.gyro.copy(), imu.accel.copy()
+    for k in np.flatnonzero(solution.gap):
+        before, after = int(store.epoch[k - 1]), int(store.epoch[k])
+        length = imu.time[k] - imu.time[k - 1]
+        # Epochs end at both sides of a gap; between them lie the updates of fixes inside it.
+        inside = np.arange(before + 1, after + 1)
+        jump = solution.shift(np.array([after]))[0] - solution.shift(np.array([before]))[0]
+        jump = jump + store.epoch_dx[inside, : states.NAVIGATION].sum(axis=0)
+        to_body = quaternion_to_dcm(store.q[k]).T
+        gyro[k] += to_body @ jump[states.ATTITUDE] / length
+        accel[k] += to_body @ jump[states.VELOCITY] / length
+    return Imu(imu.time, gyro, accel)

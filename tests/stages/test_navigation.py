@@ -10,36 +10,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import simulated
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 from scipy.special import j1
 from scipy.stats import chi2
+from simulated import LEVER, RLG, errors, measured, rms, thinned, truth
 
 from pipeline.campaign import read_campaign
 from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu, ThermalCorrection, Trajectory
-from stages.navigation import NavigationResult, NavigationSettings, kalman, pos, run
+from stages.navigation import NavigationResult, NavigationSettings, kalman, output, pos, run, states
 from stages.navigation.alignment import level
 from stages.navigation.mechanisation import increments, quaternion_to_dcm, step
-from stages.navigation.output import assemble
+from stages.navigation.solve import Problem, solve
+from stages.navigation.standstill import Standstill
 from tsmftis import geodesy
 from tsmftis.camera import Mounting
-from tsmftis.inertial import DEG_PER_H, MICRO_G, ImuModel, SensorModel
 from tsmftis.rotation import dcm_to_quaternion, log_so3, rpy_to_dcm
-from tsmftis.simulator import flight, gnss, inertial
-from tsmftis.simulator.harmonics import Harmonics
+from tsmftis.simulator import flight
 
 SHARED = Path(os.environ.get("TSMFTIS_SHARED", Path(__file__).parents[2].parent / "shared")) / "campaigns"
-LEVER = np.array([0.45, -0.2, -1.35])
-MODEL = ImuModel(
-    100.0,
-    SensorModel(np.deg2rad(0.001) / 60.0, 0.01 * DEG_PER_H, 3600.0, 5e-6),
-    SensorModel(12.0 * MICRO_G, 50.0 * MICRO_G, 3600.0, 20e-6),
-)
-SIGMA_POSITION, SIGMA_VELOCITY = np.array([0.02, 0.02, 0.04]), np.array([0.02, 0.02, 0.02])
-SIGMA_RPY = np.deg2rad([0.05, 0.05, 0.5])
+MODEL = RLG.model
+SIGMA_RPY = RLG.sigma_rpy
 FLIGHTS = 12
 
 
@@ -50,95 +44,14 @@ def needs(campaign: str) -> pytest.MarkDecorator:
 # --- flights ---------------------------------------------------------------------------------------------------------
 
 
-def aircraft(seed: int) -> flight.Flight:
-    """About 120 s: straight, a coordinated 90° turn, straight, in gusts, wobbling and vibrating."""
-    rng = np.random.default_rng([41, seed])
-    path = flight.plan(
-        [flight.Leg(duration=40.0, climb=5.0), flight.Leg(turn=np.pi / 2, bank=0.4), flight.Leg(duration=45.0)],
-        latitude=0.65 + 0.02 * seed,
-        longitude=2.13,
-        height=1000.0,
-        course=float(rng.uniform(0, 2 * np.pi)),
-        speed=60.0,
-        bank_ramp=4.0,
-        pitch=0.02,
-        drift_angle=0.03,
-    )
-    shaking = flight.wobble(np.deg2rad([0.4, 0.3, 0.3]), np.array([1.0, 1.0, 0.5]), 8, rng)
-    shaking += flight.vibration(np.deg2rad([0.3, 0.3, 0.1]), (8.0, 25.0), 5, rng)
-    return flight.Flight(path, flight.gusts(np.full(3, 0.3), 0.05, 0.8, 8, rng).integral(), shaking)
-
-
-def car() -> flight.Flight:
-    """25 s at rest, then off at 1 m/s² to 15 m/s, with two bends: a vehicle that must align itself from standstill."""
-    time = np.arange(0.0, 120.0 + 0.005, 0.01)
-    ramp = np.clip((time - 25.0) / 20.0, 0.0, 1.0)
-    speed = 15.0 * 0.5 * (1.0 - np.cos(np.pi * ramp))
-    bend = np.clip((time - 50.0) / 12.0, 0, 1), np.clip((time - 75.0) / 12.0, 0, 1)
-    course = 0.8 + 1.5 * (bend[0] - np.sin(2 * np.pi * bend[0]) / (2 * np.pi))
-    course -= 2.0 * (bend[1] - np.sin(2 * np.pi * bend[1]) / (2 * np.pi))
-
-    def integral(rate: np.ndarray) -> np.ndarray:
-        return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1])) * 0.01])
-
-    north, east = geodesy.radii_of_curvature(0.7)
-    lat = 0.7 + integral(speed * np.cos(course)) / (north + 50.0)
-    lon = -1.8 + integral(speed * np.sin(course)) / ((east + 50.0) * np.cos(0.7))
-    at = slice(None, None, 50)
-    ecef = geodesy.geodetic_to_ecef(lat, lon, np.full_like(lat, 50.0))
-    attitude = np.stack([np.full_like(time, 0.03), np.full_like(time, -0.02), course], -1)
-    path = flight.Path(
-        120.0,
-        ecef[0],
-        make_interp_spline(time[at], np.stack([lat, lon, np.full_like(lat, 50.0)], -1)[at], k=5),
-        make_interp_spline(time[at], (ecef - ecef[0])[at], k=5),
-        make_interp_spline(time[at], attitude[at], k=5),
-    )
-    still = Harmonics(np.zeros((3, 1)), np.ones((3, 1)), np.zeros((3, 1)))
-    return flight.Flight(path, still, still)
-
-
-def truth(craft: flight.Flight, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Geodetic position, NED velocity and C_body→NED at times."""
-    geodetic, rpy = craft.navigation(time)
-    to_ecef = geodesy.ned_to_ecef_dcm(geodetic[:, 0], geodetic[:, 1])
-    return geodetic, np.einsum("nji,nj->ni", to_ecef, craft.velocity(time)), rpy_to_dcm(*rpy.T)
-
-
 @cache
-def ideal(seed: int, rate: float = 100.0) -> tuple[flight.Flight, Imu]:
-    craft = aircraft(seed) if seed >= 0 else car()
-    time = np.arange(1, int((craft.path.duration - 0.5) * rate)) / rate
-    return craft, Imu(time, *inertial.interval_means(craft, time, 1.0 / rate))
+def flown(seed: int, rate: float = 100.0) -> tuple[flight.Flight, Imu]:
+    craft = simulated.aircraft(seed) if seed >= 0 else simulated.drive()
+    return craft, simulated.ideal(craft, rate)
 
 
-def measured(imu: Imu, rng: np.random.Generator) -> Imu:
-    """With the errors that MODEL declares: scale factors, Gauss–Markov biases, white noise."""
-    interval = float(np.median(np.diff(imu.time)))
-    g, a = MODEL.gyro, MODEL.accel
-    errors = inertial.UnitErrors(
-        g.scale_factor_sigma * rng.standard_normal(3), a.scale_factor_sigma * rng.standard_normal(3), np.zeros(3)
-    )
-    biases = [
-        inertial.gauss_markov(s.bias_sigma, s.bias_correlation_time, interval, imu.time.size, rng) for s in (g, a)
-    ]
-    white = [s.white_noise / np.sqrt(interval) for s in (g, a)]
-    return Imu(imu.time, *inertial.measure(imu.gyro, imu.accel, errors, *biases, *white, rng))
-
-
-def fixes(craft: flight.Flight, imu: Imu, rng: np.random.Generator, velocity: bool = True) -> Gnss:
-    time = np.arange(1.0, imu.time[-1] - 0.3, 0.2)
-    seen = gnss.observe(
-        craft,
-        time,
-        LEVER,
-        0.0,
-        SIGMA_POSITION * rng.standard_normal((time.size, 3)),
-        SIGMA_VELOCITY * rng.standard_normal((time.size, 3)),
-    )
-    sigma_r, sigma_v = np.tile(SIGMA_POSITION, (time.size, 1)), np.tile(SIGMA_VELOCITY, (time.size, 1))
-    extra = (seen.velocity, sigma_v) if velocity else (None, None)
-    return Gnss(time, *seen.geodetic.T, sigma_r, *extra, np.ones(time.size, np.int64))
+def fixes(craft: flight.Flight, imu: Imu, rng: np.random.Generator) -> Gnss:
+    return simulated.fixes(craft, float(imu.time[-1]) - 0.3, rng)
 
 
 @dataclass(frozen=True)
@@ -163,36 +76,10 @@ class Case:
 
 @cache
 def case(seed: int) -> Case:
-    craft, imu = ideal(seed)
+    craft, imu = flown(seed)
     rng = np.random.default_rng([97, abs(seed), seed < 0])
-    start = craft.navigation(np.array([0.5]))[1][0] + SIGMA_RPY * rng.standard_normal(3)
-    return Case(craft, measured(imu, rng), fixes(craft, imu, rng), (0.5, start, SIGMA_RPY))
-
-
-def errors(craft: flight.Flight, trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Truth minus estimate: position NED [m], velocity NED [m/s], rotation vector in NED [rad] (n, 3) each."""
-    geodetic, velocity, dcm = truth(craft, trajectory.time)
-    north, east = geodesy.radii_of_curvature(geodetic[:, 0])
-    position = np.stack(
-        [
-            (geodetic[:, 0] - trajectory.latitude) * (north + geodetic[:, 2]),
-            (geodetic[:, 1] - trajectory.longitude) * (east + geodetic[:, 2]) * np.cos(geodetic[:, 0]),
-            trajectory.height - geodetic[:, 2],
-        ],
-        -1,
-    )
-    turn = log_so3(dcm @ np.swapaxes(rpy_to_dcm(*trajectory.rpy.T), 1, 2))
-    return position, velocity - trajectory.velocity, turn
-
-
-def thinned(t: Trajectory) -> Trajectory:
-    """Every 20th sample, away from the ends."""
-    names = [n for n in t.__dataclass_fields__]
-    return Trajectory(**{n: getattr(t, n)[500:-500:20] for n in names})
-
-
-def rms(x: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(x))))
+    start = simulated.attitude_known_to(craft, SIGMA_RPY, rng)
+    return Case(craft, measured(imu, MODEL, rng), fixes(craft, imu, rng), start)
 
 
 # --- strapdown -------------------------------------------------------------------------------------------------------
@@ -218,7 +105,7 @@ def test_strapdown_reproduces_a_trajectory_worked_out_in_the_inertial_frame() ->
 
     The bounds are three to five times that, a tenth of a fix's sigma.
     """
-    craft, imu = ideal(0, 400.0)
+    craft, imu = flown(0, 400.0)
     fine, coarse = dead_reckoning(craft, imu), dead_reckoning(craft, merged(imu, np.full(imu.time.size // 2, 2)))
     print("strapdown", fine, coarse)
     assert coarse[0] < 2e-3 and coarse[1] < 5e-5 and coarse[2] < 1e-9
@@ -291,16 +178,24 @@ def test_levelling_finds_roll_and_pitch_for_a_known_yaw(
 def test_smoother_equals_batch_least_squares() -> None:
     """A random linear problem of 12 epochs, solved at once from prior, dynamics and fixes: equal to 1e-8 of each sigma."""
     rng = np.random.default_rng(3)
-    n, epochs = kalman.NSTATE, 12
+    active = states.estimated(tuple(states.GROUPS))
+    n, epochs, nav = active.size, 12, states.NAVIGATION
     size = np.where(np.arange(epochs) % 3 == 0, 3, 6)
-    phi = np.eye(n) + 0.1 * rng.standard_normal((epochs, n, n))
+    top, decay = 0.1 * rng.standard_normal((epochs, nav, n)), rng.uniform(0.8, 1.0, (epochs, 6))
+    top[:, :, :nav] += np.eye(nav)
+    phi = np.zeros((epochs, n, n))
+    phi[:, :nav], phi[:, nav:, nav:] = top, np.eye(n - nav)
+    for i in range(6):
+        phi[:, nav + i, nav + i] = decay[:, i]
     q, p0 = np.diag(rng.uniform(0.5, 1.0, n)), np.diag(rng.uniform(1.0, 4.0, n))
     H, R = rng.standard_normal((epochs, 6, n)), rng.uniform(0.1, 1.0, (epochs, 6))
     z, start = rng.standard_normal((epochs, 6)), rng.standard_normal(n)
     fix = np.where(np.arange(epochs) == 5, -1, np.arange(epochs))  # one epoch without a fix
 
-    covariance, estimate = np.empty((epochs, n, n)), np.empty((epochs, n))
-    S_inv, K, y = np.zeros((epochs, 6, 6)), np.zeros((epochs, n, 6)), np.zeros((epochs, 6))
+    store = kalman.Store.empty(1, epochs, epochs, n)._replace(
+        epoch_phi=top, epoch_decay=decay, epoch_measurement=fix, H=H
+    )
+    estimate = np.empty((epochs, n))
     x, P = start, p0
     for e in range(epochs):
         if e:
@@ -309,16 +204,15 @@ def test_smoother_equals_batch_least_squares() -> None:
             m = size[e]
             h = H[e, :m]
             S = h @ P @ h.T + np.diag(R[e, :m])
-            S_inv[e, :m, :m] = np.linalg.inv(S)
-            K[e, :, :m] = P @ h.T @ S_inv[e, :m, :m]
-            y[e, :m] = z[e, :m] - h @ x
-            x, P = x + K[e, :, :m] @ y[e, :m], (np.eye(n) - K[e, :, :m] @ h) @ P
-        covariance[e], estimate[e] = 0.5 * (P + P.T), x
-    correction, smoothed = np.empty((epochs, n)), np.empty((epochs, 9, 9))
-    store = kalman.Store.empty(1, epochs, epochs)._replace(
-        epoch_P=covariance, epoch_phi=phi, epoch_fix=fix, H=H, S_inv=S_inv, K=K, innovation=y
-    )
-    kalman.backward(epochs, size, store, correction, smoothed)
+            store.rows[e] = m
+            store.S_inv[e, :m, :m] = np.linalg.inv(S)
+            store.K[e, :, :m] = P @ h.T @ store.S_inv[e, :m, :m]
+            store.y[e, :m] = z[e, :m] - h @ x
+            x, P = x + store.K[e, :, :m] @ store.y[e, :m], (np.eye(n) - store.K[e, :, :m] @ h) @ P
+        kalman.pack(0.5 * (P + P.T), store.epoch_P[e])
+        estimate[e] = x
+    out = kalman.Smoothed.empty(epochs, n, np.arange(0, epochs, 2))
+    kalman.backward(epochs, active, store, out)
 
     rows, right = [np.eye(epochs * n)[:n] / np.sqrt(np.diag(p0))[:, None]], [start / np.sqrt(np.diag(p0))]
     for e in range(1, epochs):
@@ -336,9 +230,10 @@ def test_smoother_equals_batch_least_squares() -> None:
     best = np.linalg.lstsq(A, b, rcond=None)[0].reshape(epochs, n)
     full = np.linalg.inv(A.T @ A)
     sigma = np.sqrt(np.diag(full)).reshape(epochs, n)
-    assert np.abs((estimate + correction - best) / sigma).max() < 1e-8
+    assert np.abs((estimate + out.correction - best) / sigma).max() < 1e-8
     for e in range(epochs):
-        np.testing.assert_allclose(smoothed[e], full[e * n : e * n + 9, e * n : e * n + 9], rtol=1e-7, atol=1e-8)
+        np.testing.assert_allclose(out.covariance[e], full[e * n : e * n + 9, e * n : e * n + 9], rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(out.variance, sigma[::2, nav:] ** 2, rtol=1e-7)
 
 
 @dataclass(frozen=True)
@@ -356,37 +251,40 @@ class Inside:
 @cache
 def inside(seed: int) -> Inside:
     this = case(seed)
-    chosen = NavigationSettings()
-    start = pos._start(this.imu, this.gnss, LEVER, chosen, this.initial)
+    chosen, theta = NavigationSettings(), pos.declared(Mounting(LEVER), {})
+    start = pos._start(this.imu, this.gnss, LEVER, MODEL, Standstill.none(), chosen, this.initial)
     imu = pos._from(this.imu, start.time)
-    s = pos._filter_and_smooth(imu, this.gnss, MODEL, LEVER, chosen, start)
-    result = assemble(imu, this.gnss, s, start, 1)
+    s = solve(Problem(imu, this.gnss, MODEL, chosen, Standstill.none(), start, theta, 0.0))
     # Stamps on which an epoch ends, well inside: there the estimate and the epoch's covariance belong together.
-    on_epoch = np.flatnonzero(np.abs(s["epoch_time"][s["epoch"]] - imu.time) < 1e-9)
+    store = s.store
+    on_epoch = np.flatnonzero(np.abs(store.epoch_time[store.epoch] - imu.time) < 1e-9)
     at = on_epoch[np.searchsorted(imu.time[on_epoch], [30.0, 60.0, 90.0])]
     geodetic, velocity, dcm = truth(this.craft, imu.time[at])
     north, east = geodesy.radii_of_curvature(geodetic[:, 0])
     metres = np.stack([north + geodetic[:, 2], (east + geodetic[:, 2]) * np.cos(geodetic[:, 0]), -np.ones(3)], -1)
-    w, x, y, z = s["q"][at].T
+    w, x, y, z = store.q[at].T
     estimated = Rotation.from_quat(np.stack([x, y, z, w], -1)).as_matrix()
     error = np.concatenate(
         [
-            (geodetic - s["position"][at]) * metres,
-            velocity - s["velocity"][at],
+            (geodetic - store.position[at]) * metres,
+            velocity - store.velocity[at],
             log_so3(dcm @ np.swapaxes(estimated, 1, 2)),
         ],
         axis=1,
     )
-    epochs = s["epoch"][at]
-    left = error - s["correction"][epochs][:, :9]
+    epochs = store.epoch[at]
+    left = error - s.shift(epochs)
+    covariance = np.empty((at.size, s.problem.active.size, s.problem.active.size))
+    for k, e in enumerate(epochs):
+        kalman.unpack(store.epoch_P[e], covariance[k])
     nees = [
         np.einsum("ni,nij,nj->n", e, np.linalg.inv(P), e)
-        for e, P in ((error, s["epoch_P"][epochs][:, :9, :9]), (left, s["smoothed_P"][epochs]))
+        for e, P in ((error, covariance[:, :9, :9]), (left, s.smoothed.covariance[epochs]))
     ]
-    t = thinned(result.trajectory)
+    t = thinned(output.trajectory(s))
     r, v, rpy = errors(this.craft, t)
     scaled = np.concatenate([r / t.sigma_position, v / t.sigma_velocity, rpy / t.sigma_attitude], axis=1)
-    return Inside(*nees, np.abs(error), np.abs(left), scaled, s["nis"][s["used"]])
+    return Inside(*nees, np.abs(error), np.abs(left), scaled, store.nis[store.used])
 
 
 def test_sigmas_of_filter_and_smoother_are_those_of_their_errors() -> None:
@@ -491,7 +389,7 @@ def test_unequal_stamps_and_other_rates() -> None:
     uneven = np.where(rng.random(this.imu.time.size) < 0.2, 2, 1)
     uneven = uneven[np.cumsum(uneven) <= this.imu.time.size]
     pairs = np.full(this.imu.time.size // 2, 2)
-    fast = measured(ideal(0, 400.0)[1], rng)
+    fast = measured(flown(0, 400.0)[1], MODEL, rng)
     for imu, bound in ((merged(this.imu, uneven), 0.02), (merged(this.imu, pairs), 0.05), (fast, 0.02)):
         result = this.solve(imu)
         assert result.quality["imu_gap_count"] == 0 and result.quality["fixes"]["rejected"] == 0

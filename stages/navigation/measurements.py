@@ -1,0 +1,117 @@
+"""What the filter is told besides the inertial data, as one list in order of time.
+
+Functions
+---------
+withheld        fixes that the settings keep from the filter
+gather          fixes, standstill windows and, in free-inertial mode, heights → `kalman.Measurements`
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.records import GNSS_QUALITIES, Gnss, Imu
+from stages.navigation import kalman
+from stages.navigation.settings import NavigationSettings
+from stages.navigation.standstill import Standstill
+
+Array = NDArray[np.float64]
+
+STANDSTILL_STEP = 2  # windows: every second one is used, so that sway is not counted as often as it is sampled
+BAROMETER_STEP = 1.0  # s between heights in free-inertial mode
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """The measurements, the true time that each fix stands for, and for each fix its place among the measurements (m,)."""
+
+    measurements: kalman.Measurements
+    fix_time: Array
+    of_fix: NDArray[np.int64]
+
+
+def withheld(time: Array, settings: NavigationSettings) -> NDArray[np.bool_]:
+    """Which fixes at `time` (n,) [s] the settings keep from the filter."""
+    out = np.zeros(time.size, np.bool_)
+    for start, stop in settings.withhold_s:
+        out |= (time >= start) & (time <= stop)
+    if settings.withhold_every_s is not None and time.size:
+        period, length = settings.withhold_every_s
+        out |= (time - time[0]) % period >= period - length
+    if settings.free_inertial_after_s is not None:
+        out |= time > settings.free_inertial_after_s
+    return out
+
+
+def gather(imu: Imu, gnss: Gnss, still: Standstill, latency: float, settings: NavigationSettings) -> Gathered:
+    """Measurements of a flight; a fix stands for its stamp − latency, with its own sigmas times the factor of its quality."""
+    fix_time = gnss.time - latency
+    with_velocity = gnss.velocity is not None and gnss.sigma_velocity is not None and settings.use_gnss_velocity
+    factor = np.ones(gnss.time.size)
+    for quality, value in zip(GNSS_QUALITIES, settings.sigma_factor, strict=True):
+        factor[gnss.quality == quality] = value
+    nfix = gnss.time.size
+    velocity = gnss.velocity if with_velocity and gnss.velocity is not None else np.zeros((nfix, 3))
+    sigma_velocity = gnss.sigma_velocity if with_velocity and gnss.sigma_velocity is not None else np.ones((nfix, 3))
+    middle = imu.time[1:] - 0.5 * np.diff(imu.time)
+    rate, force = (
+        np.stack([np.interp(fix_time, middle, values[1:, i]) for i in range(3)], 1) for values in (imu.gyro, imu.accel)
+    )
+    kept = ~withheld(gnss.time, settings)
+    parts = [
+        (
+            fix_time,
+            np.full(nfix, kalman.FIX),
+            np.full(nfix, 6 if with_velocity else 3),
+            kept,
+            np.stack([gnss.latitude, gnss.longitude, gnss.height], 1),
+            velocity,
+            np.concatenate([gnss.sigma_position, sigma_velocity], 1) ** 2 * factor[:, None] ** 2,
+            rate,
+            force,
+        )
+    ]
+    every = slice(None, None, STANDSTILL_STEP)
+    count = still.start[every].size
+    parts.append(
+        (
+            still.stop[every],
+            np.full(count, kalman.STANDSTILL),
+            np.full(count, 6),
+            np.ones(count, np.bool_),
+            np.zeros((count, 3)),
+            np.zeros((count, 3)),
+            np.concatenate([np.full((count, 3), settings.standstill_sigma_m_per_s**2), still.variance[every]], 1),
+            still.rate[every],
+            still.force[every],
+        )
+    )
+    if settings.free_inertial_after_s is not None:
+        chosen = np.flatnonzero(gnss.time > settings.free_inertial_after_s)
+        chosen = chosen[np.unique((gnss.time[chosen] / BAROMETER_STEP).astype(np.int64), return_index=True)[1]]
+        size = chosen.size
+        variance = np.ones((size, 6))
+        variance[:, 0] = settings.free_inertial_height_sigma_m**2
+        parts.append(
+            (
+                fix_time[chosen],
+                np.full(size, kalman.HEIGHT),
+                np.ones(size, np.int64),
+                np.ones(size, np.bool_),
+                np.stack([gnss.latitude, gnss.longitude, gnss.height], 1)[chosen],
+                np.zeros((size, 3)),
+                variance,
+                rate[chosen],
+                force[chosen],
+            )
+        )
+    joined = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    order = np.argsort(joined[0], kind="stable")
+    place = np.empty(order.size, np.int64)
+    place[order] = np.arange(order.size)
+    sorted_columns = [np.ascontiguousarray(column[order]) for column in joined]
+    measurements = kalman.Measurements(*sorted_columns)
+    return Gathered(measurements, fix_time, place[:nfix])

@@ -1,0 +1,179 @@
+"""One pass of filter and smoother over a flight: from records to the compiled kernels and back.
+
+Functions
+---------
+prepare         inertial data, measurements and their models → what the kernels take
+filter_only     the filter alone over the first part of a flight: how likely its fixes are
+solve           filter and smoother
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from pipeline.records import DATA_GAP, Gnss, Imu
+from stages.navigation import kalman, states
+from stages.navigation.alignment import Start
+from stages.navigation.measurements import Gathered, gather
+from stages.navigation.settings import NavigationSettings
+from stages.navigation.standstill import Standstill
+from tsmftis.geodesy import STANDARD_GRAVITY
+from tsmftis.inertial import DEG_PER_H, ImuModel
+from tsmftis.rotation import dcm_to_quaternion, rpy_jacobian, rpy_to_dcm
+
+Array = NDArray[np.float64]
+
+HISTORY = 400  # epochs at which a pass keeps what the quality figures are made of
+STANDSTILL_NOISE = 0.1  # of the gyros' white noise: what may turn a body that stands
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a pass works on. `theta` (19,) declares the parameters; `latency` is taken off the stamps beforehand, so that what the
+    filter still estimates of it is small."""
+
+    imu: Imu
+    gnss: Gnss
+    model: ImuModel
+    settings: NavigationSettings
+    still: Standstill
+    start: Start
+    theta: Array
+    latency: float
+
+    @property
+    def active(self) -> NDArray[np.int64]:
+        return states.estimated(self.settings.estimate)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """One pass: the filter's store, the smoother's output, and what they were made from."""
+
+    problem: Problem
+    gathered: Gathered
+    gap: NDArray[np.bool_]
+    count: int
+    store: kalman.Store
+    smoothed: kalman.Smoothed
+
+    @property
+    def epochs(self) -> slice:
+        return slice(0, self.count)
+
+    def theta(self) -> Array:
+        """Smoothed parameters after each epoch (count, 19); the latency is that still in the stamps."""
+        theta = self.store.epoch_theta[self.epochs].copy()
+        active = self.problem.active[states.NAVIGATION :] - states.NAVIGATION
+        theta[:, active] += self.smoothed.correction[:, states.NAVIGATION :]
+        return theta
+
+    def shift(self, epochs: NDArray[np.int64] | slice) -> Array:
+        """Smoothed minus filtered position, velocity, attitude after the epochs (k, 9)."""
+        return np.asarray(self.smoothed.correction[epochs, : states.NAVIGATION])
+
+
+def initial_covariance(start: Start, model: ImuModel, settings: NavigationSettings) -> Array:
+    """P at the start over all states (28, 28)."""
+    variance = np.zeros(states.STATES)
+    variance[states.POSITION], variance[states.VELOCITY] = start.sigma_position**2, start.sigma_velocity**2
+    g_sensitivity = settings.g_sensitivity_sigma_deg_per_h_per_g * DEG_PER_H / STANDARD_GRAVITY
+    for group, sigma in {
+        "gyro_bias": model.gyro.bias_sigma,
+        "accel_bias": model.accel.bias_sigma,
+        "gyro_scale_factor": model.gyro.scale_factor_sigma,
+        "accel_scale_factor": model.accel.scale_factor_sigma,
+        "gyro_g_sensitivity": g_sensitivity,
+        "antenna_lever_arm": settings.lever_arm_sigma_m,
+        "gnss_latency": settings.gnss_latency_sigma_s,
+    }.items():
+        variance[states.GROUPS[group]] = sigma**2
+    P = np.diag(variance)
+    # Sigmas of roll, pitch, yaw into the NED rotation vector: φ = M·δrpy, the inverse of `rpy_jacobian`.
+    to_ned = np.linalg.inv(rpy_jacobian(start.rpy[None])[0])
+    P[states.ATTITUDE, states.ATTITUDE] = to_ned @ np.diag(start.sigma_rpy**2) @ to_ned.T
+    return P
+
+
+def process_noise(model: ImuModel) -> Array:
+    """Spectral densities [unit²/s] of the states (28,): white noise into v and φ, 2σ²/τ into the Gauss–Markov biases."""
+    noise = np.zeros(states.STATES)
+    noise[states.VELOCITY], noise[states.ATTITUDE] = model.accel.white_noise**2, model.gyro.white_noise**2
+    for group, sensor in (("gyro_bias", model.gyro), ("accel_bias", model.accel)):
+        noise[states.GROUPS[group]] = 2.0 * sensor.bias_sigma**2 / sensor.bias_correlation_time
+    return noise
+
+
+def gaps(time: Array) -> NDArray[np.bool_]:
+    """Which samples close a gap in the data (n,)."""
+    steps = np.diff(time, prepend=time[0])
+    return np.asarray(steps > DATA_GAP * np.median(steps[1:]))
+
+
+def _unit(problem: Problem, gap: NDArray[np.bool_]) -> kalman.Unit:
+    imu, model = problem.imu, problem.model
+    longest = float(np.diff(imu.time).max())
+    noise = process_noise(model)
+    # Inside a gap the body moves as it does elsewhere: the data's own scatter, held over the gap, as white noise.
+    gap_noise = np.zeros(states.STATES)
+    if gap.any():
+        gap_noise[states.ATTITUDE] = imu.gyro.var(axis=0).max() * longest
+        gap_noise[states.VELOCITY] = imu.accel.var(axis=0).max() * longest
+    still_noise = noise.copy()
+    still_noise[states.ATTITUDE] *= STANDSTILL_NOISE**2
+    tau = np.repeat([model.gyro.bias_correlation_time, model.accel.bias_correlation_time], 3)
+    still = problem.still.holds(imu.time)
+    return kalman.Unit(imu.time, imu.gyro, imu.accel, gap, still, noise, gap_noise, still_noise, 1.0 / tau)
+
+
+def _filter(problem: Problem) -> tuple[Gathered, NDArray[np.bool_], int, kalman.Store]:
+    imu, settings, start = problem.imu, problem.settings, problem.start
+    gathered = gather(imu, problem.gnss, problem.still, problem.latency, settings)
+    gap = gaps(imu.time)
+    unit = _unit(problem, gap)
+    active = problem.active
+    measurements = gathered.measurements
+    inside = int(((measurements.time >= imu.time[0]) & (measurements.time <= imu.time[-1])).sum())
+    changes = int(np.count_nonzero(np.diff(unit.still)))
+    size = inside + int(np.ceil((imu.time[-1] - imu.time[0]) / settings.epoch_s)) + 2 * int(gap.sum()) + changes + 2
+    store = kalman.Store.empty(imu.time.size, size, measurements.time.size, active.size)
+    gates = np.array([0.0] + [chi2.isf(settings.gate_probability, m) for m in range(1, 7)])
+    theta = problem.theta.copy()
+    theta[states.parameter("gnss_latency")] -= problem.latency
+    count = kalman.forward(
+        unit,
+        measurements,
+        active,
+        start.position.copy(),
+        start.velocity.copy(),
+        dcm_to_quaternion(rpy_to_dcm(*start.rpy)),
+        theta,
+        initial_covariance(start, problem.model, settings)[np.ix_(active, active)],
+        settings.epoch_s,
+        gates,
+        settings.reentry_s,
+        store,
+    )
+    return gathered, gap, count, store
+
+
+def likelihood(problem: Problem, until: float) -> float:
+    """Σ −½(min(NIS, gate) + ln det S) over the fixes up to `until` [s]: how well a start explains them."""
+    time = problem.imu.time
+    stop = int(np.searchsorted(time, until, side="right"))
+    imu = Imu(time[:stop], problem.imu.gyro[:stop], problem.imu.accel[:stop])
+    _, _, _, store = _filter(replace(problem, imu=imu))
+    return float(store.loglike.sum())
+
+
+def solve(problem: Problem) -> Solution:
+    """Filter and smoother over the whole flight."""
+    gathered, gap, count, store = _filter(problem)
+    chosen = np.unique(np.linspace(0, count - 1, min(HISTORY, count)).astype(np.int64))
+    smoothed = kalman.Smoothed.empty(count, problem.active.size, chosen)
+    kalman.backward(count, problem.active, store, smoothed)
+    return Solution(problem, gathered, gap, count, store, smoothed)
