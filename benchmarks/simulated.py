@@ -7,7 +7,7 @@ Functions
 ---------
 aircraft, survey, drive, racetrack      motions
 ideal, measured, fixes                  what perfect and real sensors say of them
-truth, errors                           the true path; truth minus estimate
+truth, errors, consistency              the true path; truth minus estimate; NEES
 """
 
 from __future__ import annotations
@@ -18,8 +18,11 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
 
 from pipeline.records import Gnss, Imu, Trajectory
+from stages.navigation import kalman
+from stages.navigation.solve import Solution
 from stages.simulation import SimulationSettings
 from stages.simulation.sensors import fly
 from tsmftis import geodesy
@@ -32,6 +35,7 @@ Array = NDArray[np.float64]
 
 LEVER = np.array([0.45, -0.2, -1.35])
 SIGMA_POSITION, SIGMA_VELOCITY = np.array([0.02, 0.02, 0.04]), np.array([0.02, 0.02, 0.02])
+STILL = Harmonics(np.zeros((3, 1)), np.ones((3, 1)), np.zeros((3, 1)))
 
 
 @dataclass(frozen=True)
@@ -73,8 +77,10 @@ def _shaken(path: flight.Path, rng: np.random.Generator, terms: int = 8) -> flig
     return flight.Flight(path, flight.gusts(np.full(3, 0.3), 0.05, 0.8, terms, rng).integral(), shaking)
 
 
-def flown(legs: list[flight.Leg], seed: int, *, speed: float = 60.0, height: float = 1000.0) -> flight.Flight:
-    """An aircraft along these legs, place and course drawn from the seed."""
+def flown(
+    legs: list[flight.Leg], seed: int, *, speed: float = 60.0, height: float = 1000.0, calm: bool = False
+) -> flight.Flight:
+    """An aircraft along these legs, place and course drawn from the seed; `calm`: nothing shakes it."""
     rng = np.random.default_rng([41, seed])
     path = flight.plan(
         legs,
@@ -87,7 +93,7 @@ def flown(legs: list[flight.Leg], seed: int, *, speed: float = 60.0, height: flo
         pitch=0.02,
         drift_angle=0.03,
     )
-    return _shaken(path, rng)
+    return flight.Flight(path, STILL, STILL) if calm else _shaken(path, rng)
 
 
 def aircraft(seed: int) -> flight.Flight:
@@ -149,8 +155,7 @@ def drive(seed: int = 0, stops: bool = False) -> flight.Flight:
         make_interp_spline(time[at], (ecef - ecef[0])[at], k=5),
         make_interp_spline(time[at], attitude[at], k=5),
     )
-    still = Harmonics(np.zeros((3, 1)), np.ones((3, 1)), np.zeros((3, 1)))
-    return flight.Flight(path, still, still)
+    return flight.Flight(path, STILL, STILL)
 
 
 # --- sensors ---------------------------------------------------------------------------------------------------------
@@ -162,11 +167,11 @@ def ideal(craft: flight.Flight, rate: float) -> Imu:
     return Imu(time, *inertial.interval_means(craft, time, 1.0 / rate))
 
 
-def measured(imu: Imu, model: ImuModel, rng: np.random.Generator) -> Imu:
-    """With the errors that the model declares: scale factors, Gauss–Markov biases, white noise."""
+def measured(imu: Imu, model: ImuModel, rng: np.random.Generator, constant: inertial.UnitErrors | None = None) -> Imu:
+    """With the errors that the model declares: scale factors (or those of `constant`), Gauss–Markov biases, white noise."""
     interval = float(np.median(np.diff(imu.time)))
     g, a = model.gyro, model.accel
-    errors = inertial.UnitErrors(
+    errors = constant or inertial.UnitErrors(
         g.scale_factor_sigma * rng.standard_normal(3), a.scale_factor_sigma * rng.standard_normal(3), np.zeros(3)
     )
     biases = [
@@ -174,6 +179,23 @@ def measured(imu: Imu, model: ImuModel, rng: np.random.Generator) -> Imu:
     ]
     white = [s.white_noise / np.sqrt(interval) for s in (g, a)]
     return Imu(imu.time, *inertial.measure(imu.gyro, imu.accel, errors, *biases, *white, rng))
+
+
+def shaken(imu: Imu, craft: flight.Flight, rng: np.random.Generator) -> Imu:
+    """Engine and road on top, as noise of a sample: at rest 2 mrad/s and 0.03 m/s², moving twenty times that at 15 m/s."""
+    speed = np.linalg.norm(craft.velocity(imu.time), axis=1)
+    size = (1.0 + 20.0 * np.clip(speed / 15.0, 0.0, 1.0))[:, None]
+    return Imu(
+        imu.time,
+        imu.gyro + 2e-3 * size * _zero_mean(rng, imu.gyro.shape),
+        imu.accel + 0.03 * size * _zero_mean(rng, imu.accel.shape),
+    )
+
+
+def _zero_mean(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Differences of white noise: a vibration, which integrates to nothing."""
+    white = rng.standard_normal((shape[0] + 1, shape[1]))
+    return np.asarray(np.diff(white, axis=0) / np.sqrt(2.0))
 
 
 def fixes(
@@ -216,20 +238,51 @@ def truth(craft: flight.Flight, time: Array) -> tuple[Array, Array, Array]:
     return geodetic, np.einsum("nji,nj->ni", to_ecef, craft.velocity(time)), rpy_to_dcm(*rpy.T)
 
 
+def metres(geodetic: Array) -> Array:
+    """∂(north, east, down)/∂(latitude, longitude, height) at (n, 3) [m/rad, m/rad, −1]."""
+    north, east = geodesy.radii_of_curvature(geodetic[:, 0])
+    return np.stack(
+        [north + geodetic[:, 2], (east + geodetic[:, 2]) * np.cos(geodetic[:, 0]), -np.ones(len(geodetic))], -1
+    )
+
+
 def errors(craft: flight.Flight, trajectory: Trajectory) -> tuple[Array, Array, Array]:
     """Truth minus estimate: position NED [m], velocity NED [m/s], rotation vector in NED [rad] (n, 3) each."""
     geodetic, velocity, dcm = truth(craft, trajectory.time)
-    north, east = geodesy.radii_of_curvature(geodetic[:, 0])
-    position = np.stack(
-        [
-            (geodetic[:, 0] - trajectory.latitude) * (north + geodetic[:, 2]),
-            (geodetic[:, 1] - trajectory.longitude) * (east + geodetic[:, 2]) * np.cos(geodetic[:, 0]),
-            trajectory.height - geodetic[:, 2],
-        ],
-        -1,
-    )
+    estimate = np.stack([trajectory.latitude, trajectory.longitude, trajectory.height], -1)
+    position = (geodetic - estimate) * metres(geodetic)
     turn = log_so3(dcm @ np.swapaxes(rpy_to_dcm(*trajectory.rpy.T), 1, 2))
     return position, velocity - trajectory.velocity, turn
+
+
+def consistency(craft: flight.Flight, solution: Solution, times: list[float]) -> tuple[Array, Array, Array, Array]:
+    """NEES of filter and smoother over position, velocity, attitude (9) at about these times, and their errors (k, 9).
+
+    The stamps taken are those on which an epoch ends: there the estimate and the epoch's covariance belong together.
+    """
+    store, imu = solution.store, solution.problem.imu
+    on_epoch = np.flatnonzero(np.abs(store.epoch_time[store.epoch] - imu.time) < 1e-9)
+    at = on_epoch[np.searchsorted(imu.time[on_epoch], times)]
+    geodetic, velocity, dcm = truth(craft, imu.time[at])
+    estimated = Rotation.from_quat(store.q[at], scalar_first=True).as_matrix()
+    error = np.concatenate(
+        [
+            (geodetic - store.position[at]) * metres(geodetic),
+            velocity - store.velocity[at],
+            log_so3(dcm @ np.swapaxes(estimated, 1, 2)),
+        ],
+        axis=1,
+    )
+    epochs = store.epoch[at]
+    left = error - solution.shift(epochs)
+    covariance = np.empty((at.size, solution.problem.active.size, solution.problem.active.size))
+    for k, e in enumerate(epochs):
+        kalman.unpack(store.epoch_P[e], covariance[k])
+    ahead, after = (
+        np.einsum("ni,nij,nj->n", e, np.linalg.inv(P), e)
+        for e, P in ((error, covariance[:, :9, :9]), (left, solution.smoothed.covariance[epochs]))
+    )
+    return ahead, after, error, left
 
 
 def thinned(t: Trajectory, step: int = 20, edge: int = 500) -> Trajectory:

@@ -105,6 +105,7 @@ def _provenance(plan: Plan) -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": {name: version(name) for name in PACKAGES},
         "settings": plan.settings.model_dump(mode="json"),
+        "model_update": plan.update,
     }
 
 

@@ -22,13 +22,18 @@ from pipeline.campaign import Campaign, read_campaign
 from pipeline.datasets import write_dataset
 from pipeline.errors import InputError
 from pipeline.formats import sbet, smrmsg
+from pipeline.formats.table import write_csv
+from pipeline.model_update import Effects
 from pipeline.raster import Dem, Quicklook, open_cube
 from pipeline.records import CameraPoses, Imu, Spectra, ThermalCorrection, Tracks, Trajectory
 from pipeline.run_stage import StageRecord, run_stage, write_json
 from stages import bench as bench_stage
 from stages import mapping, navigation, reconstruction, registration, scoring, thermal, tracking
 from tsmftis import __version__
+from tsmftis.effects import EFFECTS
 from tsmftis.fourier import smooth_phase
+
+UPDATED = frozenset({"navigation"})  # stages whose models take a model update
 
 # Each stage and the stages whose results it reads, in the order in which a reader should meet them.
 NEEDS: Mapping[str, tuple[str, ...]] = {
@@ -62,10 +67,15 @@ class Plan:
     start: str | None = None  # --from: this stage and those after it run again
     only: str | None = None  # --only: this stage alone
     lines: tuple[str, ...] = ()  # --line: LINE or FLIGHT/LINE; empty: all
+    update: Effects = field(default_factory=dict)  # --model-update: what the declared models lack
 
     @cached_property
     def opened(self) -> Campaign:
         return read_campaign(self.campaign)
+
+    def effects(self, stage: str) -> Effects:
+        """The update's effects on a stage's model."""
+        return {name: values for name, values in self.update.items() if EFFECTS[name].stage == stage}
 
     def wants(self, flight: str, line: str) -> bool:
         return not self.lines or line in self.lines or f"{flight}/{line}" in self.lines
@@ -157,6 +167,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
                 plan.settings.navigation,
                 initial=_initial(campaign, flight),
                 correction=correction,
+                effects=plan.effects("navigation"),
             )
         if correction is not None:
             write_dataset(correction.to_dataset(), to["correction"])
@@ -173,6 +184,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         ("stages.navigation", "stages.thermal", "pipeline.formats.sbet", "pipeline.formats.smrmsg"),
         {
             "settings": _plain(plan.settings.navigation),
+            "effects": plan.effects("navigation"),
             "about": about,
             "imu": _plain(instrument.imu),
             "initial": _plain(entry.initial),
@@ -187,7 +199,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
 
 
 def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
-    """Trajectory, frame times and targets → pos_tracks.nc (nominal and tracking) and poses.nc."""
+    """Trajectory, frame times and targets → pos_tracks.nc (nominal and tracking), poses.nc (camera), events.csv (unit)."""
     campaign = plan.opened
     entry, instrument = campaign.line(flight, line), campaign.instrument
     trajectory = plan.out / flight / "trajectory.nc"
@@ -205,6 +217,7 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
             )
         write_dataset(result.tracks.to_dataset(), to["tracks"])
         write_dataset(result.poses.to_dataset(), to["poses"])
+        write_csv(result.events, to["events"], ("frame", np.arange(result.events.time.size)))
         return {
             "course_deg": float(np.rad2deg(result.course)) % 360.0,
             "ground_speed_m_per_s": result.ground_speed,
@@ -215,7 +228,7 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
         plan.out,
         "tracking",
         f"{flight}/{line}",
-        ("stages.tracking",),
+        ("stages.tracking", "pipeline.formats.table"),
         {
             "settings": _plain(plan.settings.tracking),
             "camera": _plain(instrument.camera),
@@ -226,7 +239,11 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
             "frames": campaign.path(entry.frames),
             "targets": campaign.path(entry.targets),
         },
-        {"tracks": f"{flight}/{line}/pos_tracks.nc", "poses": f"{flight}/{line}/poses.nc"},
+        {
+            "tracks": f"{flight}/{line}/pos_tracks.nc",
+            "poses": f"{flight}/{line}/poses.nc",
+            "events": f"{flight}/{line}/events.csv",
+        },
         work,
         **plan.switches("tracking"),
     )

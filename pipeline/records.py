@@ -528,7 +528,7 @@ class Trajectory:
     """The POS result at the IMU's origin: latitude, longitude [rad], height [m], velocity NED (n, 3) [m/s], rpy (n, 3) [rad].
 
     `sigma_attitude` is of roll, pitch, yaw [rad]; `rate` (n, 3) [rad/s] and `specific_force` (n, 3) [m/s²] are the
-    compensated inertial data in body axes (they go into the SBET).
+    compensated inertial data in body axes (they go into the SBET). Sigmas that are not known are NaN.
     """
 
     time: Array
@@ -584,17 +584,28 @@ class Trajectory:
                 take(d, path, "height", ("time",), "m"),
                 take(d, path, "velocity", ("time", "ned"), "m s-1"),
                 np.stack([angle["roll"], angle["pitch"], (angle["yaw"] + np.pi) % (2 * np.pi) - np.pi], axis=1),
-                take(d, path, "sigma_position", ("time", "ned"), "m"),
-                take(d, path, "sigma_velocity", ("time", "ned"), "m s-1"),
-                np.deg2rad(take(d, path, "sigma_attitude", ("time", "rpy"), "degrees")),
+                take(d, path, "sigma_position", ("time", "ned"), "m", finite=False),
+                take(d, path, "sigma_velocity", ("time", "ned"), "m s-1", finite=False),
+                np.deg2rad(take(d, path, "sigma_attitude", ("time", "rpy"), "degrees", finite=False)),
                 take(d, path, "rate", ("time", "axis"), "rad s-1"),
                 take(d, path, "specific_force", ("time", "axis"), "m s-2"),
             )
 
     def between(self, start: float, stop: float) -> Trajectory:
         """The samples with start ≤ time ≤ stop."""
-        inside = slice(int(np.searchsorted(self.time, start)), int(np.searchsorted(self.time, stop, side="right")))
-        return Trajectory(**{f.name: getattr(self, f.name)[inside] for f in fields(self)})
+        return self._at(
+            slice(int(np.searchsorted(self.time, start)), int(np.searchsorted(self.time, stop, side="right")))
+        )
+
+    def thinned(self, interval: float) -> Trajectory:
+        """The samples nearest to the first one's time and every `interval` [s] after it."""
+        wanted = np.arange(self.time[0], self.time[-1] + 1e-9, interval)
+        after = np.clip(np.searchsorted(self.time, wanted), 1, self.time.size - 1)
+        nearest = after - (wanted - self.time[after - 1] < self.time[after] - wanted)
+        return self._at(np.unique(nearest))
+
+    def _at(self, index: slice | NDArray[np.int64]) -> Trajectory:
+        return Trajectory(**{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
 
 @dataclass(frozen=True)

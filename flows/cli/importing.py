@@ -30,7 +30,7 @@ def import_opus(
     """Write an OPUS file's interferogram, its parameters and the vendor's spectrum as a bench file of a campaign."""
     from pipeline.formats.opus import read_opus
 
-    _writable(out)
+    writable(out)
     bench = read_opus(file)
     _write(bench.to_dataset(), out)
     scans, samples = bench.interferogram.shape
@@ -56,7 +56,7 @@ def import_pos(
     """Write an RTKLIB solution as a gnss file of a campaign; the epoch that its times count from is printed."""
     from pipeline.formats.rtklib import read_pos
 
-    _writable(out)
+    writable(out)
     gnss, start = read_pos(file, epoch)
     _write(gnss.to_dataset(), out)
     Console(highlight=False, soft_wrap=True).print(
@@ -66,7 +66,31 @@ def import_pos(
     )
 
 
-def _writable(out: Path) -> None:
+@app.command("sbet")
+def import_sbet(
+    file: Annotated[Path, typer.Argument(help="An SBET (smoothed best estimate of trajectory).")],
+    out: Annotated[Path, typer.Argument(help="The trajectory file (NetCDF-4) to write.")],
+    sigmas: Annotated[
+        Path | None, typer.Option("--smrmsg", metavar="FILE", help="The SMRMSG that goes with it: its sigmas.")
+    ] = None,
+) -> None:
+    """Write another program's trajectory as a trajectory.nc; times stay as they are in the file."""
+    from pipeline.formats import sbet, smrmsg
+
+    writable(out)
+    trajectory = sbet.to_trajectory(sbet.read_sbet(file))
+    if sigmas is not None:
+        trajectory = smrmsg.with_sigmas(trajectory, smrmsg.read_smrmsg(sigmas), sigmas)
+    _write(trajectory.to_dataset().assign_attrs(source=file.name), out)
+    said = "sigmas included" if sigmas is not None else "no --smrmsg: its sigmas are not known (NaN in the file)"
+    Console(highlight=False, soft_wrap=True).print(
+        f"{out}: {trajectory.time.size} records, {trajectory.time[0]:.3f} to {trajectory.time[-1]:.3f} s; {said}",
+        markup=False,
+    )
+
+
+def writable(out: Path) -> None:
+    """Raise InputError where `out` cannot be a new file."""
     if out.is_dir() or not out.parent.is_dir():
         raise InputError(out, "OUT", "is not a file name in an existing folder", "give for instance bench/sample.nc")
 

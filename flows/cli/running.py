@@ -13,10 +13,11 @@ from rich.console import Console
 from rich.table import Table
 
 from flows.settings import load_settings
-from flows.steps import STAGES, Plan
+from flows.steps import STAGES, UPDATED, Plan
 from pipeline.campaign import read_campaign
 from pipeline.errors import InputError
 from pipeline.inspect import check_campaign
+from pipeline.model_update import read_model_update
 from pipeline.run_stage import StageRecord
 
 
@@ -44,6 +45,10 @@ def run(
         str | None,
         typer.Option("--dask", metavar="ADDRESS", help="Run on a Dask scheduler, or 'local' (needs the extra 'dask')."),
     ] = None,
+    update: Annotated[
+        Path | None,
+        typer.Option("--model-update", metavar="FILE", help="YAML file of effects that the declared models lack."),
+    ] = None,
     settings_file: Annotated[
         Path | None,
         typer.Option("--settings", metavar="FILE", help="YAML file of settings (`tsmftis settings` prints one)."),
@@ -60,7 +65,8 @@ def run(
             raise InputError(option, f"'{stage}'", "is no stage", f"use one of {', '.join(STAGES)}")
     if start and only:
         raise InputError("--from", "with --only", "contradict each other", "give one of them")
-    plan = Plan(campaign.resolve(), out.resolve(), settings, start, only, tuple(line or ()))
+    effects = read_model_update(update, UPDATED) if update is not None else {}
+    plan = Plan(campaign.resolve(), out.resolve(), settings, start, only, tuple(line or ()), effects)
     opened = read_campaign(campaign)
     known = {i for f in opened.keys.flights for entry in f.lines for i in (entry.id, f"{f.id}/{entry.id}")}
     if unknown := [i for i in plan.lines if i not in known]:

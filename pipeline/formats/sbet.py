@@ -16,6 +16,7 @@ Functions
 ---------
 read_sbet, write_sbet       bit for bit
 from_trajectory             records of a Trajectory
+to_trajectory               and back, without sigmas
 velocity_ned, heading       as above
 
 References
@@ -102,20 +103,10 @@ def from_trajectory(trajectory: Trajectory) -> Records:
     t = trajectory
     north, east, down = t.velocity.T
     roll, pitch, yaw = t.rpy.T
+    gravity, turning = _frame(t.latitude, t.height, t.velocity, np.zeros(t.time.size))
     to_ned = rpy_to_dcm(roll, pitch, yaw)
-    meridian, prime = radii_of_curvature(t.latitude)
-    transport = np.stack(
-        [
-            east / (prime + t.height),
-            -north / (meridian + t.height),
-            -east * np.tan(t.latitude) / (prime + t.height),
-        ],
-        -1,
-    )
-    gravity = np.zeros_like(t.velocity)
-    gravity[:, 2] = normal_gravity(t.latitude, t.height)
     acceleration = t.specific_force + np.einsum("nji,nj->ni", to_ned, gravity)
-    rate = t.rate - np.einsum("nji,nj->ni", to_ned, earth_rate_ned(t.latitude) + transport)
+    rate = t.rate - np.einsum("nji,nj->ni", to_ned, turning)
     columns = (
         t.time,
         t.latitude,
@@ -135,6 +126,49 @@ def from_trajectory(trajectory: Trajectory) -> Records:
     for name, column in zip(LIMITS, columns, strict=True):
         records[name] = column
     return records
+
+
+def to_trajectory(records: Records) -> Trajectory:
+    """The inverse of `from_trajectory`: f = a − Cᵀg,  ω_ib = ω + Cᵀω_in, ω_in with the frame's own turning by ẇ.
+
+    (n,) of `DTYPE` → Trajectory of n samples; an SBET holds no sigmas, so they are NaN. Times are the file's own.
+    """
+    r = records
+    velocity = velocity_ned(r)
+    wander = np.unwrap(r["wander"])
+    wander_rate = np.gradient(wander, r["time"]) if r.size > 1 else np.zeros(r.size)
+    gravity, turning = _frame(r["latitude"], r["height"], velocity, wander_rate)
+    rpy = np.stack([r["roll"], r["pitch"], heading(r)], -1)
+    to_ned = rpy_to_dcm(*rpy.T)
+    unknown = np.full((r.size, 3), np.nan)
+    acceleration, rate = (np.stack([r[f"{name}_{axis}"] for axis in "xyz"], -1) for name in ("acceleration", "rate"))
+    return Trajectory(
+        r["time"].copy(),
+        r["latitude"].copy(),
+        r["longitude"].copy(),
+        r["height"].copy(),
+        velocity,
+        rpy,
+        unknown,
+        unknown.copy(),
+        unknown.copy(),
+        rate + np.einsum("nji,nj->ni", to_ned, turning),
+        acceleration - np.einsum("nji,nj->ni", to_ned, gravity),
+    )
+
+
+def _frame(latitude: Array, height: Array, velocity: Array, wander_rate: Array) -> tuple[Array, Array]:
+    """Gravity [m/s²] and the turning of the record's frame against the inertial one [rad/s], both in NED (n, 3).
+
+    ω_in = ω_ie + (vE/(R_E+h), −vN/(R_N+h), −vE·tan L/(R_E+h) − ẇ): the frame's axes lie at azimuth −w.
+    """
+    north, east, _ = velocity.T
+    meridian, prime = radii_of_curvature(latitude)
+    down = -east * np.tan(latitude) / (prime + height) - wander_rate
+    transport = np.stack([east / (prime + height), -north / (meridian + height), down], -1)
+    gravity = np.zeros_like(velocity)
+    gravity[:, 2] = normal_gravity(latitude, height)
+    return gravity, earth_rate_ned(latitude) + transport
 
 
 def velocity_ned(records: Records) -> Array:

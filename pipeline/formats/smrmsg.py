@@ -7,6 +7,7 @@ Functions
 ---------
 read_smrmsg, write_smrmsg       bit for bit
 from_trajectory                 a trajectory's sigmas as records
+with_sigmas                     a trajectory with the sigmas of records
 
 References
 ----------
@@ -15,6 +16,7 @@ References
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,3 +62,32 @@ def from_trajectory(trajectory: Trajectory) -> NDArray[Any]:
     for name, column in zip(FIELDS, columns, strict=True):
         records[name] = column
     return records
+
+
+def with_sigmas(trajectory: Trajectory, records: NDArray[Any], path: Path) -> Trajectory:
+    """The trajectory with sigmas from records (n,), which usually come once a second, linearly between them.
+
+    Raises InputError where the records do not span the trajectory (but for a second at its ends).
+    """
+    time = records["time"]
+    if (np.diff(time) <= 0).any():
+        i = int(np.argmax(np.diff(time) <= 0)) + 1
+        raise InputError(path, f"record {i}, time", "is not after the one before it", "sort the records")
+    if time[0] > trajectory.time[0] + 1.0 or time[-1] < trajectory.time[-1] - 1.0:
+        raise InputError(
+            path,
+            "time",
+            f"spans {time[0]:.1f} to {time[-1]:.1f} s but the SBET {trajectory.time[0]:.1f} to {trajectory.time[-1]:.1f} s",
+            "give the SMRMSG of the same flight",
+        )
+
+    def at(*names: str) -> NDArray[np.float64]:
+        return np.stack([np.interp(trajectory.time, time, records[name]) for name in names], -1)
+
+    axes = ("north", "east", "down")
+    return replace(
+        trajectory,
+        sigma_position=at(*(f"position_{a}" for a in axes)),
+        sigma_velocity=at(*(f"velocity_{a}" for a in axes)),
+        sigma_attitude=at("roll", "pitch", "heading") / ARC_MINUTES,
+    )

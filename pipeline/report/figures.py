@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 COLOURS = {"nominal": "#8c8c8c", "registration": "#e07b00", "tracking": "#0b63b0", "reference": "#111111"}
 SENSOR = {"raw": "#8c8c8c", "polynomial": "#b07aa1", "rbf": "#e07b00", "bayesian_rbf": "#0b63b0"}
 AXES = ("x", "y", "z")
+NED = ("north", "east", "down")
+ANGLES = ("roll", "pitch", "yaw")
+PALETTE = ("#0b63b0", "#e07b00", "#3a9a4d")  # of three axes
 MOST_POINTS = 1500
 
 
@@ -50,13 +53,15 @@ def thin(*series: Array) -> list[list[float]]:
 def trajectory_map(
     trajectory: Trajectory, lines: dict[str, tuple[float, float]], targets: dict[str, Targets]
 ) -> go.Figure:
-    """Plan view in kilometres about the flight's middle, its lines and targets."""
+    """Plan view about the flight's middle, its lines and targets; in metres where it is less than 2 km across."""
     origin = (
         float(np.median(trajectory.latitude)),
         float(np.median(trajectory.longitude)),
         float(np.median(trajectory.height)),
     )
-    ned = local_metres(trajectory.latitude, trajectory.longitude, trajectory.height, *origin) / 1000.0
+    ned = local_metres(trajectory.latitude, trajectory.longitude, trajectory.height, *origin)
+    unit, scale = ("m", 1.0) if np.ptp(ned[:, :2], axis=0).max() < 2000.0 else ("km", 1e-3)
+    ned *= scale
     figure = go.Figure()
     along, right = thin(ned[:, 0], ned[:, 1])
     figure.add_scatter(x=right, y=along, mode="lines", name="flight", line={"color": "#777", "width": 1.5})
@@ -65,7 +70,7 @@ def trajectory_map(
         n, e = thin(ned[inside, 0], ned[inside, 1])
         figure.add_scatter(x=e, y=n, mode="lines", name=f"line {name}", line={"width": 5})
     for name, t in targets.items():
-        at = local_metres(t.latitude, t.longitude, t.height, *origin) / 1000.0
+        at = scale * local_metres(t.latitude, t.longitude, t.height, *origin)
         figure.add_scatter(
             x=at[:, 1].tolist(),
             y=at[:, 0].tolist(),
@@ -75,14 +80,14 @@ def trajectory_map(
             marker={"symbol": "square-open", "size": 5, "color": "#111"},
         )
     north, east = np.rad2deg(origin[0]), np.rad2deg(origin[1])
-    figure.update_xaxes(title=f"east [km] of {north:.5f}°, {east:.5f}°")
-    figure.update_yaxes(title="north [km]", scaleanchor="x", scaleratio=1)
+    figure.update_xaxes(title=f"east [{unit}] of {north:.5f}°, {east:.5f}°")
+    figure.update_yaxes(title=f"north [{unit}]", scaleanchor="x", scaleratio=1)
     return layout(figure, 520)
 
 
 def attitude(trajectory: Trajectory, lines: dict[str, tuple[float, float]]) -> go.Figure:
-    """Height, ground speed, roll, pitch and heading over time, the lines shaded."""
-    names = ("height [m]", "ground speed [m/s]", "roll [°]", "pitch [°]", "heading [°], unwrapped")
+    """Height, ground speed, roll, pitch and heading (unwrapped) over time, the lines shaded."""
+    names = ("height [m]", "speed [m/s]", "roll [°]", "pitch [°]", "heading [°]")
     speed = np.hypot(trajectory.velocity[:, 0], trajectory.velocity[:, 1])
     rpy = np.rad2deg(trajectory.rpy)
     heading = np.rad2deg(np.unwrap(trajectory.rpy[:, 2]))
@@ -96,50 +101,149 @@ def attitude(trajectory: Trajectory, lines: dict[str, tuple[float, float]]) -> g
         )
         figure.update_yaxes(title=name, row=i, col=1)
     _shade(figure, lines)
-    figure.update_xaxes(title="time [s after the epoch]", row=5, col=1)
+    figure.update_xaxes(title="time [s after the epoch]", exponentformat="none", separatethousands=False, row=5, col=1)
     return layout(figure, 760)
 
 
 def navigation_quality(
-    trajectory: Trajectory, figures: dict[str, list[float]], lines: dict[str, tuple[float, float]]
+    trajectory: Trajectory, quality: dict[str, Any], lines: dict[str, tuple[float, float]]
 ) -> go.Figure:
-    """Formal sigmas of position and attitude, fix residuals, and the innovations' NIS."""
+    """Sigmas of position and attitude, smoothed and forward; fixes minus path; NIS of the fixes against its band."""
     figure = make_subplots(rows=4, cols=1, shared_xaxes=True, vertical_spacing=0.04)
-    palette = ("#0b63b0", "#e07b00", "#3a9a4d")
-    for i, name in enumerate(("north", "east", "down")):
-        time, y = thin(trajectory.time, trajectory.sigma_position[:, i])
-        figure.add_scatter(
-            x=time, y=y, name=name, legendgroup=name, line={"color": palette[i], "width": 1.2}, row=1, col=1
-        )
-        time, y = thin(np.array(figures["residual_time"]), np.array(figures[f"residual_{name}"]))
-        figure.add_scatter(
-            x=time,
-            y=y,
-            mode="markers",
-            name=name,
-            legendgroup=name,
-            showlegend=False,
-            marker={"color": palette[i], "size": 3},
-            row=3,
-            col=1,
-        )
-    for i, name in enumerate(("roll", "pitch", "yaw")):
-        time, y = thin(trajectory.time, np.rad2deg(trajectory.sigma_attitude[:, i]))
-        figure.add_scatter(
-            x=time, y=y, name=name, line={"color": palette[i], "width": 1.2, "dash": "dash"}, row=2, col=1
-        )
-    time, y = thin(np.array(figures["fix_time"]), np.array(figures["fix_nis"]))
-    figure.add_scatter(
-        x=time, y=y, mode="markers", name="NIS", showlegend=False, marker={"color": "#555", "size": 3}, row=4, col=1
+    history = quality["history_time"]
+    sigmas = (
+        (NED, trajectory.sigma_position, "forward_sigma_position", 1),
+        (ANGLES, np.rad2deg(trajectory.sigma_attitude), "forward_sigma_deg", 2),
     )
-    for row, name in enumerate(("σ position [m]", "σ attitude [°]", "fix − path [m]", "NIS of fixes [1]"), start=1):
+    for names, values, forward, row in sigmas:
+        for i, name in enumerate(names):
+            time, y = thin(trajectory.time, values[:, i])
+            line = {"color": PALETTE[i], "width": 1.4}
+            figure.add_scatter(x=time, y=y, name=name, legendgroup=name, line=line, row=row, col=1)
+            dotted = line | {"dash": "dot", "width": 1.0}
+            y = quality[f"{forward}_{name}"]
+            figure.add_scatter(
+                x=history,
+                y=y,
+                name=f"{name}, forward only",
+                legendgroup=name,
+                showlegend=False,
+                line=dotted,
+                row=row,
+                col=1,
+            )
+    for i, name in enumerate(NED):
+        for kind, symbol in (("residual", "circle"), ("withheld", "x")):
+            time, y = thin(np.array(quality[f"{kind}_time"]), np.array(quality[f"{kind}_{name}"]))
+            marker = {"color": PALETTE[i], "size": 3 if kind == "residual" else 6, "symbol": symbol}
+            figure.add_scatter(
+                x=time, y=y, mode="markers", legendgroup=name, showlegend=False, marker=marker, row=3, col=1
+            )
+    time, y = thin(np.array(quality["fix_time"]), np.array(quality["fix_nis_over_expected"]))
+    figure.add_scatter(x=time, y=y, mode="markers", showlegend=False, marker={"color": "#999", "size": 3}, row=4, col=1)
+    blocks = quality["nis_blocks"]
+    _band(figure, blocks["time"], blocks["low"], blocks["high"], "95 % of a mean", 4)
+    figure.add_scatter(
+        x=blocks["time"], y=blocks["mean"], name="mean NIS", line={"color": "#c0392b", "width": 1.8}, row=4, col=1
+    )
+    for row, name in enumerate(("σ position [m]", "σ attitude [°]", "fix − path [m]", "NIS / expected [1]"), start=1):
         figure.update_yaxes(title=name, row=row, col=1)
+        if row != 3:
+            figure.update_yaxes(type="log", exponentformat="none", row=row, col=1)
     _shade(figure, lines)
-    figure.update_yaxes(type="log", exponentformat="none", row=4, col=1)
-    figure.update_yaxes(type="log", exponentformat="none", row=2, col=1)
-    figure.update_yaxes(type="log", exponentformat="none", row=1, col=1)
-    figure.update_xaxes(title="time [s after the epoch]", row=4, col=1)
-    return layout(figure, 760)
+    figure.update_xaxes(title="time [s after the epoch]", exponentformat="none", separatethousands=False, row=4, col=1)
+    return layout(figure, 820)
+
+
+def separation(quality: dict[str, Any], lines: dict[str, tuple[float, float]]) -> go.Figure:
+    """Backward minus forward solution, each with the 95 % that their sigmas allow."""
+    figure = make_subplots(rows=6, cols=1, shared_xaxes=True, vertical_spacing=0.025)
+    time = quality["history_time"]
+    for first, key, scale, unit in ((1, "", 1.0, "m"), (4, "_deg", 1.0, "°")):
+        for i, name in enumerate(NED):
+            value, sigma = quality[f"separation{key}_{name}"], quality[f"separation_sigma{key}_{name}"]
+            known = [j for j, v in enumerate(value) if v is not None]
+            at = [time[j] for j in known]
+            band = [1.96 * scale * sigma[j] for j in known]
+            _band(figure, at, [-b for b in band], band, "95 % by the sigmas", first + i, show=first + i == 1)
+            figure.add_scatter(
+                x=at,
+                y=[scale * value[j] for j in known],
+                showlegend=False,
+                line={"color": PALETTE[i], "width": 1.3},
+                row=first + i,
+                col=1,
+            )
+            figure.update_yaxes(title=f"{name if unit == 'm' else 'φ ' + name} [{unit}]", row=first + i, col=1)
+    _shade(figure, lines)
+    figure.update_xaxes(title="time [s after the epoch]", exponentformat="none", separatethousands=False, row=6, col=1)
+    return layout(figure, 900)
+
+
+def sensor_errors(quality: dict[str, Any], lines: dict[str, tuple[float, float]]) -> go.Figure:
+    """What the filter estimates beside the path, smoothed, with one sigma either side."""
+    groups = quality["parameters"]
+    shown = {
+        "gyro_bias": ("gyro bias [°/h]", 1.0 / DEG_PER_H),
+        "accel_bias": ("accel bias [µg]", 1.0 / MICRO_G),
+        "gyro_scale_factor": ("gyro scale [ppm]", 1e6),
+        "accel_scale_factor": ("accel scale [ppm]", 1e6),
+        "gyro_g_sensitivity": ("gyro g-sens. [°/h/g]", 9.80665 / DEG_PER_H),
+        "antenna_lever_arm": ("lever arm [m]", 1.0),
+        "gnss_latency": ("latency [ms]", 1e3),
+    }
+    names = [name for name in shown if name in groups]
+    figure = make_subplots(rows=max(len(names), 1), cols=1, shared_xaxes=True, vertical_spacing=0.04)
+    time = quality["history_time"]
+    for row, name in enumerate(names, start=1):
+        title, scale = shown[name]
+        for i, (value, sigma) in enumerate(zip(groups[name]["value"], groups[name]["sigma"], strict=True)):
+            low = [scale * (v - s) for v, s in zip(value, sigma, strict=True)]
+            high = [scale * (v + s) for v, s in zip(value, sigma, strict=True)]
+            colour = PALETTE[i]
+            _band(figure, time, low, high, f"{AXES[i]}, ±1 σ", row, show=False, colour=colour)
+            figure.add_scatter(
+                x=time,
+                y=[scale * v for v in value],
+                name=AXES[i],
+                legendgroup=AXES[i],
+                showlegend=row == 1,
+                line={"color": colour, "width": 1.4},
+                row=row,
+                col=1,
+            )
+        figure.update_yaxes(title=title, row=row, col=1)
+    _shade(figure, lines)
+    figure.update_xaxes(
+        title="time [s after the epoch]", exponentformat="none", separatethousands=False, row=max(len(names), 1), col=1
+    )
+    return layout(figure, 120 + 180 * max(len(names), 1))
+
+
+def _band(
+    figure: go.Figure,
+    x: list[float],
+    low: list[float],
+    high: list[float],
+    name: str,
+    row: int,
+    show: bool = True,
+    colour: str = "#0b63b0",
+) -> None:
+    """A shaded band between two curves."""
+    figure.add_scatter(
+        x=[*x, *x[::-1]],
+        y=[*high, *low[::-1]],
+        fill="toself",
+        mode="none",
+        fillcolor=colour,
+        opacity=0.18,
+        name=name,
+        showlegend=show,
+        hoverinfo="skip",
+        row=row,
+        col=1,
+    )
 
 
 def _shade(figure: go.Figure, lines: dict[str, tuple[float, float]]) -> None:

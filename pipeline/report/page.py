@@ -103,6 +103,8 @@ def _flight(campaign: Campaign, out: Path, flight: str, run: dict[str, Any], dra
             "map": draw.html(figures.trajectory_map(trajectory, spans, targets)),
             "attitude": draw.html(figures.attitude(trajectory, spans)),
             "quality": draw.html(figures.navigation_quality(trajectory, quality, spans)),
+            "separation": draw.html(figures.separation(quality, spans)),
+            "sensor_errors": draw.html(figures.sensor_errors(quality, spans)),
         }
     for line in lines:
         entry["lines"].append(_line(campaign, out, flight, line, run["flights"][flight]["lines"][line], draw))

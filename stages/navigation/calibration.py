@@ -66,22 +66,34 @@ def _sentence(
     """Which of the parameters this flight tells, and which it cannot, and what flight would."""
     speed = float(np.median(np.hypot(trajectory.velocity[:, 0], trajectory.velocity[:, 1])))
     unseen = sigma > UNSEEN * prior
-    told = [label for label, no in zip(labels, unseen, strict=True) if not no]
     parts = []
-    if told:
-        parts.append(f"This flight tells {_listed(told)}.")
-    for i in np.flatnonzero(unseen):
+    if not unseen.all():
+        told = [
+            f"{label} to {1e3 * s:.2g} {'mm' if label != 'latency' else 'ms'}"
+            for label, s, no in zip(labels, sigma, unseen, strict=True)
+            if not no
+        ]
+        parts.append(f"This flight tells {_listed(told)} (1 σ).")
+    silent = []
+    for i in range(len(labels)):
         others = np.abs(correlation[i]).copy()
         others[i] = 0.0
-        if sigma[i] > CONFOUNDED * alone[i] and others.max() > 0.5:
-            rival = labels[int(np.argmax(others))]
+        rival = int(np.argmax(others))
+        tied = sigma[i] > CONFOUNDED * alone[i] and others[rival] > 0.5
+        pair = f"{labels[i]} from {labels[rival]} (correlation {correlation[i, rival]:+.3f})"
+        if unseen[i] and tied:
             parts.append(
-                f"It cannot separate {labels[i]} from {rival} (correlation {correlation[i, int(np.argmax(others))]:+.3f}): at a "
-                f"steady {speed:.0f} m/s only their sum along the course shows."
+                f"It cannot separate {pair}: at a steady {speed:.0f} m/s only their sum along the course shows."
             )
-        else:
-            parts.append(f"It says nothing of {labels[i]} beyond what was assumed.")
-    if unseen.any():
+        elif unseen[i]:
+            silent.append(labels[i])
+        elif tied and i < rival:
+            parts.append(f"It barely separates {pair}.")
+    if silent:
+        parts.append(
+            f"It says nothing of {_listed(silent)} beyond what was assumed: on a steady straight line they only shift the path."
+        )
+    if unseen.any() or len(parts) > 1:
         parts.append("Turns to both sides and changes of speed would tell.")
     return " ".join(parts)
 

@@ -3,6 +3,7 @@
 Functions
 ---------
 withheld        fixes that the settings keep from the filter
+at_instants     rate and force at the instant of a fix
 gather          fixes, standstill windows and, in free-inertial mode, heights → `kalman.Measurements`
 """
 
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from pipeline.records import GNSS_QUALITIES, Gnss, Imu
 from stages.navigation import kalman
@@ -21,6 +23,7 @@ from stages.navigation.standstill import Standstill
 Array = NDArray[np.float64]
 
 STANDSTILL_STEP = 2  # windows: every second one is used, so that sway is not counted as often as it is sampled
+BLOCK, EDGE = 50_000, 32  # samples at a time, and beyond either side: a spline forgets its ends in a dozen
 BAROMETER_STEP = 1.0  # s between heights in free-inertial mode
 
 
@@ -46,6 +49,27 @@ def withheld(time: Array, settings: NavigationSettings) -> NDArray[np.bool_]:
     return out
 
 
+def at_instants(time: Array, means: Array, wanted: Array) -> Array:
+    """Instantaneous values (m, 3) at `wanted` [s] (sorted) of what was recorded as means over the intervals that end at `time`.
+
+    The derivative of a cubic spline through the running integral: at half the Nyquist frequency it is 5 % short, where
+    interpolating the means is 36 % short, which would take a lever arm in a vibrating body for longer than it is.
+    """
+    out = np.empty((wanted.size, 3))
+    step = np.diff(time)
+    place = np.clip(np.searchsorted(time, wanted), 0, time.size - 1)
+    for start in range(0, time.size, BLOCK):
+        chosen = slice(*np.searchsorted(place, [start, start + BLOCK]))
+        if chosen.start == chosen.stop:
+            continue
+        part = slice(max(start - EDGE, 0), min(start + BLOCK + EDGE, time.size))
+        increments = means[part][1:] * step[part.start : part.stop - 1, None]
+        integral = np.concatenate([np.zeros((1, 3)), np.cumsum(increments, axis=0)])
+        spline = CubicSpline(time[part], integral, axis=0)
+        out[chosen] = spline(np.clip(wanted[chosen], time[part][0], time[part][-1]), 1)
+    return out
+
+
 def gather(imu: Imu, gnss: Gnss, still: Standstill, latency: float, settings: NavigationSettings) -> Gathered:
     """Measurements of a flight; a fix stands for its stamp − latency, with its own sigmas times the factor of its quality."""
     fix_time = gnss.time - latency
@@ -56,10 +80,7 @@ def gather(imu: Imu, gnss: Gnss, still: Standstill, latency: float, settings: Na
     nfix = gnss.time.size
     velocity = gnss.velocity if with_velocity and gnss.velocity is not None else np.zeros((nfix, 3))
     sigma_velocity = gnss.sigma_velocity if with_velocity and gnss.sigma_velocity is not None else np.ones((nfix, 3))
-    middle = imu.time[1:] - 0.5 * np.diff(imu.time)
-    rate, force = (
-        np.stack([np.interp(fix_time, middle, values[1:, i]) for i in range(3)], 1) for values in (imu.gyro, imu.accel)
-    )
+    rate, force = (at_instants(imu.time, values, fix_time) for values in (imu.gyro, imu.accel))
     kept = ~withheld(gnss.time, settings)
     parts = [
         (

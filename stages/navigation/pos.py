@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu, ThermalCorrection, Trajectory
 from stages.navigation import output, quality, states
 from stages.navigation.alignment import Start, align, starting_at
+from stages.navigation.measurements import withheld
 from stages.navigation.settings import NavigationSettings
 from stages.navigation.solve import Problem, Solution, likelihood, solve
 from stages.navigation.standstill import Standstill, find
@@ -30,7 +31,7 @@ HEADING_SIGMA = np.deg2rad(20.0)  # of each of them
 TRIAL_S = 120.0  # of flight that a heading is tried on
 COURSE_SIGMA = np.deg2rad(40.0)  # how far a vehicle's heading may be from its course, where nothing else tells
 SETTLED = np.deg2rad(0.5)  # a smoothed correction of the first attitude below this needs no further pass
-SETTLED_LATENCY = 1e-3  # s
+SETTLED_LATENCY = 1e-4  # s: 2 % of the period of a 50 Hz vibration, which swings the antenna
 
 Effects = Mapping[str, Mapping[str, float]]
 
@@ -62,26 +63,42 @@ def run(
     model, by the contract's names ({"gnss_latency": {"latency": 0.04}}). Raises InputError where IMU and GNSS do not overlap,
     where the inertial data have a gap that nothing can bridge, or where the two clocks part.
     """
-    imu = in_body_axes(imu, mounting, correction)
-    theta = declared(mounting, effects or {})
-    _overlap(imu, gnss)
-    _bridgeable(imu, settings)
-    lever = theta[states.parameter("antenna_lever_arm")]
-    late = float(theta[states.parameter("gnss_latency")][0])
-    kept = _unless(gnss, quality.withheld_fixes(gnss, settings))
-    shifted = replace(kept, time=kept.time - late)
-    still = find(imu, shifted, model.gyro.white_noise) if settings.standstill_updates else Standstill.none()
-    start = _start(imu, shifted, lever, model, still, settings, initial)
-    used = _from(imu, start.time)
-    problem = Problem(used, gnss, model, settings, still.after(start.time), start, theta, late)
-    problem = _surest_heading(problem, imu, shifted, lever, model, still, settings, initial)
-    solution, passes = _repeated(problem)
+    solution, passes = smooth(imu, gnss, model, mounting, settings, initial, correction, effects or {})
     histories = quality.histories(solution)
     # What is left needs none of the matrices, which are most of a long flight's memory.
     solution = replace(solution, store=quality.without_matrices(solution.store))
     trajectory = output.trajectory(solution)
-    figures_of_merit, figures = quality.assess(solution, trajectory, histories, start, passes)
+    figures_of_merit, figures = quality.assess(solution, trajectory, histories, passes)
     return NavigationResult(trajectory, figures_of_merit, figures)
+
+
+def smooth(
+    imu: Imu,
+    gnss: Gnss,
+    model: ImuModel,
+    mounting: Mounting,
+    settings: NavigationSettings,
+    initial: tuple[float, Array, Array] | None = None,
+    correction: ThermalCorrection | None = None,
+    effects: Effects | None = None,
+) -> tuple[Solution, int]:
+    """Filter and smoother as `run` has them, with all their matrices, and the number of passes."""
+    imu = in_body_axes(imu, mounting, correction)
+    theta = declared(mounting, effects or {})
+    _overlap(imu, gnss)
+    _bridgeable(imu, settings)
+    late = float(theta[states.parameter("gnss_latency")][0])
+    kept = _unless(gnss, withheld(gnss.time, settings))
+    kept = replace(kept, time=kept.time - late)
+    still = find(imu, kept, model.gyro.white_noise) if settings.standstill_updates else Standstill.none()
+    lever = theta[states.parameter("antenna_lever_arm")]
+
+    def start_at(offset: float) -> Start:
+        return _start(imu, kept, lever, model, still, settings, initial, offset)
+
+    start = start_at(0.0)
+    problem = Problem(_from(imu, start.time), gnss, model, settings, still.after(start.time), start, theta, theta, late)
+    return _repeated(_surest_heading(problem, kept, start_at, initial is None))
 
 
 def in_body_axes(imu: Imu, mounting: Mounting, correction: ThermalCorrection | None) -> Imu:
@@ -145,7 +162,7 @@ def _start(
     still: Standstill,
     settings: NavigationSettings,
     initial: tuple[float, Array, Array] | None,
-    offset: float = 0.0,
+    offset: float,
 ) -> Start:
     """The start, its heading turned by `offset` [rad] from what the course or `initial` says."""
     if gnss.time.size < 2:
@@ -164,16 +181,7 @@ def _start(
     return starting_at(max(time, float(imu.time[0])), rpy, sigma, gnss, lever, "given")
 
 
-def _surest_heading(
-    problem: Problem,
-    imu: Imu,
-    gnss: Gnss,
-    lever: Array,
-    model: ImuModel,
-    still: Standstill,
-    settings: NavigationSettings,
-    initial: tuple[float, Array, Array] | None,
-) -> Problem:
+def _surest_heading(problem: Problem, gnss: Gnss, start_at: Callable[[float], Start], aligned: bool) -> Problem:
     """The problem with the start whose heading explains the first fixes best, where the heading is not known to 9°.
 
     The filter alone is run from eight headings over the first two minutes in motion; the likelihood of the fixes decides, with
@@ -182,13 +190,15 @@ def _surest_heading(
     start = problem.start
     if start.sigma_rpy[2] < UNSURE_HEADING:
         return problem
-    known = float(start.sigma_rpy[2]) if initial is not None else COURSE_SIGMA
+    known = COURSE_SIGMA if aligned else float(start.sigma_rpy[2])
     velocity, _ = gnss_velocity(gnss)
-    fast = (np.hypot(velocity[:, 0], velocity[:, 1]) > settings.course_speed_m_per_s) & (gnss.time >= start.time)
+    fast = (np.hypot(velocity[:, 0], velocity[:, 1]) > problem.settings.course_speed_m_per_s) & (
+        gnss.time >= start.time
+    )
     until = float(gnss.time[np.argmax(fast)] if fast.any() else start.time) + TRIAL_S
     best, highest = problem, -np.inf
     for offset in HEADINGS:
-        candidate = _start(imu, gnss, lever, model, still, settings, initial, float(offset))
+        candidate = start_at(float(offset))
         candidate = replace(candidate, sigma_rpy=np.array([*candidate.sigma_rpy[:2], HEADING_SIGMA]))
         trial = replace(problem, start=candidate)
         value = likelihood(trial, until) - 0.5 * (offset / known) ** 2
@@ -220,8 +230,21 @@ def _repeated(problem: Problem) -> tuple[Solution, int]:
         start = _shifted(problem.start, solution.shift(slice(0, 1))[0]) if attitude >= SETTLED else problem.start
         imu = _bridged(solution) if solution.gap.any() else problem.imu
         problem = replace(problem, start=start, imu=imu, latency=problem.latency + late)
+        if estimates_latency and _sigma(solution, "gnss_latency") < 0.2 * settings.gnss_latency_sigma_s:
+            # Well known by now, so that a prior about the new value counts for nothing; one about the old would have the filter
+            # begin 40 ms off, in a body that vibrates at 20 Hz.
+            theta = problem.theta.copy()
+            theta[states.parameter("gnss_latency")] = problem.latency
+            problem = replace(problem, theta=theta)
         del solution  # its matrices make room for the next pass'
         number += 1
+
+
+def _sigma(solution: Solution, group: str) -> float:
+    """Sigma of a group's first parameter at the end of the flight."""
+    variance = solution.smoothed.variance[-1]
+    place = np.searchsorted(solution.problem.active, states.GROUPS[group].start) - states.NAVIGATION
+    return float(np.sqrt(variance[place]))
 
 
 def _from(imu: Imu, time: float) -> Imu:

@@ -19,10 +19,8 @@ from scipy.stats import chi2
 from pipeline.errors import InputError
 from pipeline.records import DATA_GAP, GNSS_QUALITIES, Gnss, Trajectory
 from stages.navigation import calibration, kalman, states
-from stages.navigation.alignment import Start
 from stages.navigation.measurements import withheld
 from stages.navigation.output import sigmas
-from stages.navigation.settings import NavigationSettings
 from stages.navigation.solve import Solution
 from tsmftis.geodesy import local_metres
 from tsmftis.inertial import DEG_PER_H, MICRO_G
@@ -54,11 +52,6 @@ class Histories:
     theta: Array
     theta_sigma: Array
     covariance: Array
-
-
-def withheld_fixes(gnss: Gnss, settings: NavigationSettings) -> NDArray[np.bool_]:
-    """Which fixes the settings keep from filter and alignment (n,)."""
-    return withheld(gnss.time, settings)
 
 
 def histories(solution: Solution) -> Histories:
@@ -117,7 +110,7 @@ def without_matrices(store: kalman.Store) -> kalman.Store:
 
 
 def assess(
-    solution: Solution, trajectory: Trajectory, along: Histories, start: Start, passes: int
+    solution: Solution, trajectory: Trajectory, along: Histories, passes: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Plain data for run.json, and for the figures of the report."""
     problem, store = solution.problem, solution.store
@@ -157,7 +150,7 @@ def assess(
         "sigma_position_m_median": [float(v) for v in np.median(trajectory.sigma_position, axis=0)],
         "sigma_attitude_deg_median": [float(v) for v in np.rad2deg(np.median(trajectory.sigma_attitude, axis=0))],
         "calibration": calibration.calibrated(
-            problem.settings, problem.theta, along.theta[-1], along.covariance, trajectory
+            problem.settings, problem.declared, along.theta[-1], along.covariance, trajectory
         ),
     }
     if (~kept).any():
@@ -193,6 +186,7 @@ def _innovations(solution: Solution, used: NDArray[np.bool_], nis: Array, size: 
         "innovation_nis_expected": degrees / count,
         "innovation_nis_band95": [float(low), float(high)],
         "innovation_nis_inside_band": bool(low <= mean <= high),
+        "sigma_of_unit_weight": float(np.sqrt(mean * count / degrees)),
         "innovation_nis_by_quality": by_quality,
         "innovation_over_sigma": {
             name: {"mean": float(np.nanmean(z[:, i])), "std": float(np.nanstd(z[:, i]))}
@@ -310,6 +304,21 @@ def antenna_residuals(trajectory: Trajectory, gnss: Gnss, time: Array, along: Hi
     return np.asarray(fix - local_metres(at[0], at[1], at[2], *origin) - arm)
 
 
+def _blocks(time: Array, nis: Array, size: NDArray[np.int64]) -> dict[str, list[float]]:
+    """NIS over its degrees of freedom, means of up to 100 blocks of at least 20 fixes, with the 95 % band of such a mean."""
+    count = int(np.clip(time.size // 20, 1, 100))
+    out: dict[str, list[float]] = {"time": [], "mean": [], "low": [], "high": []}
+    if not time.size:
+        return out
+    for part in np.array_split(np.arange(time.size), count):
+        degrees = float(size[part].sum())
+        low, high = chi2.ppf([0.025, 0.975], degrees) / degrees
+        values = (float(time[part].mean()), float(nis[part].sum() / degrees), float(low), float(high))
+        for name, value in zip(out, values, strict=True):
+            out[name].append(value)
+    return out
+
+
 def _figures(
     solution: Solution,
     along: Histories,
@@ -340,8 +349,8 @@ def _figures(
         }
     return {
         "fix_time": gnss.time[shown].tolist(),
-        "fix_nis": nis[shown].tolist(),
-        "fix_size": size[shown].tolist(),
+        "fix_nis_over_expected": (nis[shown] / size[shown]).tolist(),
+        "nis_blocks": _blocks(gnss.time[used], nis[used], size[used]),
         "fix_used": used[shown].astype(float).tolist(),
         "residual_time": gnss.time[used].tolist(),
         **{f"residual_{n}": residual[used][:, i].tolist() for i, n in enumerate(AXES)},

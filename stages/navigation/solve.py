@@ -33,8 +33,8 @@ STANDSTILL_NOISE = 0.1  # of the gyros' white noise: what may turn a body that s
 
 @dataclass(frozen=True)
 class Problem:
-    """What a pass works on. `theta` (19,) declares the parameters; `latency` is taken off the stamps beforehand, so that what the
-    filter still estimates of it is small."""
+    """What a pass works on. `declared` (19,) are the parameters as the campaign has them, `theta` those that the filter starts
+    from; `latency` is taken off the stamps beforehand, so that what the filter still estimates of it is small."""
 
     imu: Imu
     gnss: Gnss
@@ -42,6 +42,7 @@ class Problem:
     settings: NavigationSettings
     still: Standstill
     start: Start
+    declared: Array
     theta: Array
     latency: float
 
@@ -96,6 +97,16 @@ def initial_covariance(start: Start, model: ImuModel, settings: NavigationSettin
     # Sigmas of roll, pitch, yaw into the NED rotation vector: φ = M·δrpy, the inverse of `rpy_jacobian`.
     to_ned = np.linalg.inv(rpy_jacobian(start.rpy[None])[0])
     P[states.ATTITUDE, states.ATTITUDE] = to_ned @ np.diag(start.sigma_rpy**2) @ to_ned.T
+    # The start was taken from a fix with the declared lever arm and stamp, so its error is theirs: δr = v·δt − C·δl + …
+    from_parameters = np.zeros((3, states.STATES))
+    if "antenna_lever_arm" in settings.estimate:
+        from_parameters[:, states.GROUPS["antenna_lever_arm"]] = -rpy_to_dcm(*start.rpy)
+    if "gnss_latency" in settings.estimate:
+        from_parameters[:, states.GROUPS["gnss_latency"]] = start.velocity[:, None]
+    shared = from_parameters @ P
+    P[states.POSITION] += shared
+    P[:, states.POSITION] += shared.T
+    P[states.POSITION, states.POSITION] += shared @ from_parameters.T
     return P
 
 

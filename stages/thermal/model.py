@@ -99,8 +99,8 @@ class ThermalModel:
                 )
         return tuple(f[:, : len(c.used)] for f, c in zip(made, self.channels, strict=True))
 
-    def correction(self, temperatures: Temperatures) -> ThermalCorrection:
-        """The bias to subtract, with its sigma and the distance from the chamber's envelope.
+    def correction(self, temperatures: Temperatures, method: str = "bayesian_rbf") -> ThermalCorrection:
+        """The bias to subtract by a method, with its sigma and the distance from the chamber's envelope.
 
         Given at the readings' own times, or, where they come faster than features change, twenty times a time constant.
         A channel whose thermometer stands still while the others move is left uncompensated.
@@ -112,7 +112,7 @@ class ThermalModel:
         stuck = stuck_thermometers(temperatures, self.minimum_span_k)
         bias, sigma, distance = (np.zeros((len(time), 6)) for _ in range(3))
         for i, (channel, features) in enumerate(zip(self.channels, self.features(temperatures, time), strict=True)):
-            bias[:, i], sigma[:, i] = channel.predict(features, "none" if stuck[i] else "bayesian_rbf")
+            bias[:, i], sigma[:, i] = channel.predict(features, "none" if stuck[i] else method)
             distance[:, i] = channel.distance(features)
         return ThermalCorrection(time, bias[:, :3], bias[:, 3:], sigma[:, :3], sigma[:, 3:], distance)
 

@@ -6,7 +6,7 @@ stamp − latency, by splines through the trajectory.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from pipeline.errors import InputError, StageError
 from pipeline.records import DATA_GAP, CameraPoses, Targets, Tracks, Trajectory
 from tsmftis.camera import Camera, Mounting, camera_pose
 from tsmftis.geodesy import ecef_to_geodetic, geodetic_to_ecef, ned_to_ecef_dcm, radii_of_curvature
-from tsmftis.rotation import Attitude, rpy_to_dcm
+from tsmftis.rotation import Attitude, dcm_to_rpy, rpy_to_dcm
 
 Array = NDArray[np.float64]
 
@@ -36,10 +36,12 @@ class TrackingSettings(BaseModel):
 
 @dataclass(frozen=True)
 class TrackingResult:
-    """Tracks of `nominal` and `tracking`, the camera's pose in each frame, mean course [rad], ground speed [m/s], range [m]."""
+    """Tracks of `nominal` and `tracking`; the camera's pose in each frame, and the unit's with sigmas (the event file); mean
+    course [rad], ground speed [m/s], range [m]."""
 
     tracks: Tracks
     poses: CameraPoses
+    events: Trajectory
     course: float
     ground_speed: float
     range: float
@@ -58,7 +60,8 @@ def run(
     Raises InputError where the frames lie outside the trajectory or a target lies nowhere near the line.
     """
     time = stamps - camera.latency
-    poses = camera_poses(trajectory, time, mounting)
+    events = poses_at(trajectory, time)
+    poses = camera_poses(events, mounting)
     inside = np.isfinite(poses.centre[:, 0])
     if inside.sum() < 2:
         raise InputError(
@@ -82,35 +85,54 @@ def run(
     row, col = project(points, poses, camera)
     nominal = nominal_track(row, col, time, camera, speed, float(np.nanmean(distance_down(points, poses))))
     tracks = Tracks(("nominal", "tracking"), targets.ids, np.stack([nominal[0], row]), np.stack([nominal[1], col]))
-    return TrackingResult(tracks, poses, course, speed, float(np.nanmean(distance_down(points, poses))))
+    return TrackingResult(tracks, poses, events, course, speed, float(np.nanmean(distance_down(points, poses))))
 
 
-def camera_poses(trajectory: Trajectory, time: Array, mounting: Mounting) -> CameraPoses:
-    """The camera at times (n,) [s]; NaN where the trajectory does not reach, or has a gap in the inertial data."""
+def poses_at(trajectory: Trajectory, time: Array) -> Trajectory:
+    """The trajectory at times (n,) [s]: the unit's pose by splines, velocity, sigmas and inertial data linearly.
+
+    NaN where the trajectory does not reach, or has a gap in the inertial data: nothing tells how the body moved in a gap.
+    """
     after = np.clip(np.searchsorted(trajectory.time, time), 1, trajectory.time.size - 1)
     step = trajectory.time[after] - trajectory.time[after - 1]
     inside = (time >= trajectory.time[0]) & (time <= trajectory.time[-1])
-    # Nothing tells how the camera moved in a gap.
     inside &= step <= DATA_GAP * np.median(np.diff(trajectory.time))
-    centre, dcm = np.full((time.size, 3), np.nan), np.full((time.size, 3, 3), np.nan)
-    if inside.sum() >= 1:
+    out = {f.name: np.full((time.size, *getattr(trajectory, f.name).shape[1:]), np.nan) for f in fields(Trajectory)}
+    out["time"] = time
+    if inside.any():
         part = trajectory.between(time[inside].min() - MARGIN_S, time[inside].max() + MARGIN_S)
+        at = time[inside]
         try:
             attitude = Attitude.fit(part.time, rpy_to_dcm(*part.rpy.T))
         except ValueError as error:
             raise StageError(f"no track can be laid through these frames: {error}") from error
         north, east = radii_of_curvature(part.latitude)
-        rates = (
-            part.velocity[:, 0] / (north + part.height),
-            part.velocity[:, 1] / ((east + part.height) * np.cos(part.latitude)),
-            -part.velocity[:, 2],
-        )
-        latitude, longitude, height = (
-            CubicHermiteSpline(part.time, v, r)(time[inside])
-            for v, r in zip((part.latitude, part.longitude, part.height), rates, strict=True)
-        )
-        centre[inside], dcm[inside] = camera_pose(latitude, longitude, height, attitude(time[inside]), mounting)
-    return CameraPoses(time, centre, dcm)
+        rates = {
+            "latitude": part.velocity[:, 0] / (north + part.height),
+            "longitude": part.velocity[:, 1] / ((east + part.height) * np.cos(part.latitude)),
+            "height": -part.velocity[:, 2],
+        }
+        for name, rate in rates.items():
+            out[name][inside] = CubicHermiteSpline(part.time, getattr(part, name), rate)(at)
+        out["rpy"][inside] = np.stack(dcm_to_rpy(attitude(at)), -1)
+        for name in ("velocity", "sigma_position", "sigma_velocity", "sigma_attitude", "rate", "specific_force"):
+            values = getattr(part, name)
+            out[name][inside] = np.stack([np.interp(at, part.time, values[:, i]) for i in range(3)], -1)
+    return Trajectory(**out)
+
+
+def camera_poses(events: Trajectory, mounting: Mounting) -> CameraPoses:
+    """The camera where the unit is at `events` (n,); NaN where that is not known."""
+    centre, dcm = np.full((events.time.size, 3), np.nan), np.full((events.time.size, 3, 3), np.nan)
+    known = np.isfinite(events.latitude)
+    centre[known], dcm[known] = camera_pose(
+        events.latitude[known],
+        events.longitude[known],
+        events.height[known],
+        rpy_to_dcm(*events.rpy[known].T),
+        mounting,
+    )
+    return CameraPoses(events.time, centre, dcm)
 
 
 def mean_course(trajectory: Trajectory, start: float, stop: float) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.special import j1
 from scipy.stats import chi2
-from simulated import LEVER, RLG, errors, measured, rms, thinned, truth
+from simulated import LEVER, RLG, consistency, errors, measured, rms, thinned, truth
 
 from pipeline.campaign import read_campaign
 from pipeline.errors import InputError
@@ -24,8 +24,6 @@ from pipeline.records import Gnss, Imu, ThermalCorrection, Trajectory
 from stages.navigation import NavigationResult, NavigationSettings, kalman, output, pos, run, states
 from stages.navigation.alignment import level
 from stages.navigation.mechanisation import increments, quaternion_to_dcm, step
-from stages.navigation.solve import Problem, solve
-from stages.navigation.standstill import Standstill
 from tsmftis import geodesy
 from tsmftis.camera import Mounting
 from tsmftis.rotation import dcm_to_quaternion, log_so3, rpy_to_dcm
@@ -251,40 +249,12 @@ class Inside:
 @cache
 def inside(seed: int) -> Inside:
     this = case(seed)
-    chosen, theta = NavigationSettings(), pos.declared(Mounting(LEVER), {})
-    start = pos._start(this.imu, this.gnss, LEVER, MODEL, Standstill.none(), chosen, this.initial)
-    imu = pos._from(this.imu, start.time)
-    s = solve(Problem(imu, this.gnss, MODEL, chosen, Standstill.none(), start, theta, 0.0))
-    # Stamps on which an epoch ends, well inside: there the estimate and the epoch's covariance belong together.
-    store = s.store
-    on_epoch = np.flatnonzero(np.abs(store.epoch_time[store.epoch] - imu.time) < 1e-9)
-    at = on_epoch[np.searchsorted(imu.time[on_epoch], [30.0, 60.0, 90.0])]
-    geodetic, velocity, dcm = truth(this.craft, imu.time[at])
-    north, east = geodesy.radii_of_curvature(geodetic[:, 0])
-    metres = np.stack([north + geodetic[:, 2], (east + geodetic[:, 2]) * np.cos(geodetic[:, 0]), -np.ones(3)], -1)
-    w, x, y, z = store.q[at].T
-    estimated = Rotation.from_quat(np.stack([x, y, z, w], -1)).as_matrix()
-    error = np.concatenate(
-        [
-            (geodetic - store.position[at]) * metres,
-            velocity - store.velocity[at],
-            log_so3(dcm @ np.swapaxes(estimated, 1, 2)),
-        ],
-        axis=1,
-    )
-    epochs = store.epoch[at]
-    left = error - s.shift(epochs)
-    covariance = np.empty((at.size, s.problem.active.size, s.problem.active.size))
-    for k, e in enumerate(epochs):
-        kalman.unpack(store.epoch_P[e], covariance[k])
-    nees = [
-        np.einsum("ni,nij,nj->n", e, np.linalg.inv(P), e)
-        for e, P in ((error, covariance[:, :9, :9]), (left, s.smoothed.covariance[epochs]))
-    ]
+    s, _ = pos.smooth(this.imu, this.gnss, MODEL, Mounting(LEVER), NavigationSettings(), this.initial)
+    *nees, error, left = consistency(this.craft, s, [30.0, 60.0, 90.0])
     t = thinned(output.trajectory(s))
     r, v, rpy = errors(this.craft, t)
     scaled = np.concatenate([r / t.sigma_position, v / t.sigma_velocity, rpy / t.sigma_attitude], axis=1)
-    return Inside(*nees, np.abs(error), np.abs(left), scaled, store.nis[store.used])
+    return Inside(*nees, np.abs(error), np.abs(left), scaled, s.store.nis[s.store.used])
 
 
 def test_sigmas_of_filter_and_smoother_are_those_of_their_errors() -> None:
