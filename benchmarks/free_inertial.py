@@ -4,8 +4,8 @@
 
 Each instrument is drawn from a seed: thermal laws, thermometers' nodes, scale factors. It runs through both chamber profiles
 of the preset `survey` (the paper's), its network is trained on the first, and it flies for 3 h 20 min: outside air from 34 to
-19 °C in a climb of 15 minutes, then lines to and fro at 2800 m. Fixes end with the climb; from there the path is inertial alone but
-for its height. The flight is one of four, at 100 Hz; the error is the horizontal distance from the fixes.
+19 °C in a climb of 15 minutes, then lines to and fro at 2800 m. Fixes end with the climb; from there the path is inertial alone
+but for its height. The flight is one of four, at 100 Hz; the error is the horizontal distance from the fixes.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ SIGMA_POSITION, SIGMA_VELOCITY = np.array([0.02, 0.02, 0.04]), np.array([0.02, 0
 STILL = Harmonics(np.zeros((3, 1)), np.ones((3, 1)), np.zeros((3, 1)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grade:
     """An inertial unit, and how well the attitude handed to the POS is known (3,) [rad]."""
 
@@ -78,9 +78,15 @@ def _shaken(path: flight.Path, rng: np.random.Generator, terms: int = 8) -> flig
 
 
 def flown(
-    legs: list[flight.Leg], seed: int, *, speed: float = 60.0, height: float = 1000.0, calm: bool = False
+    legs: list[flight.Leg],
+    seed: int,
+    *,
+    speed: float = 60.0,
+    height: float = 1000.0,
+    calm: bool = False,
+    crab: float = 0.03,
 ) -> flight.Flight:
-    """An aircraft along these legs, place and course drawn from the seed; `calm`: nothing shakes it."""
+    """An aircraft along these legs, place and course drawn from the seed; `calm`: nothing shakes it; `crab`: yaw − course."""
     rng = np.random.default_rng([41, seed])
     path = flight.plan(
         legs,
@@ -91,7 +97,7 @@ def flown(
         speed=speed,
         bank_ramp=4.0,
         pitch=0.02,
-        drift_angle=0.03,
+        drift_angle=crab,
     )
     return flight.Flight(path, STILL, STILL) if calm else _shaken(path, rng)
 
@@ -118,10 +124,10 @@ def racetrack(seed: int, seconds: float) -> flight.Flight:
     return flown(legs, seed, speed=60.0)
 
 
-def drive(seed: int = 0, stops: bool = False) -> flight.Flight:
-    """A car: 25 s at rest, then up to 15 m/s with bends; with `stops`, ten minutes of town with a stop a minute."""
+def drive(seed: int = 0, stops: bool = False, rest: float = 25.0) -> flight.Flight:
+    """A car: `rest` s standing, then up to 15 m/s with bends; with `stops`, ten minutes of town with a stop a minute."""
     rng = np.random.default_rng([43, seed])
-    seconds = 625.0 if stops else 120.0
+    seconds = rest + (600.0 if stops else 95.0)
     time = np.arange(0.0, seconds + 0.005, 0.01)
     speed, course = np.zeros_like(time), np.full_like(time, 0.8)
 
@@ -130,13 +136,13 @@ def drive(seed: int = 0, stops: bool = False) -> flight.Flight:
         return np.asarray(x - np.sin(2 * np.pi * x) / (2 * np.pi))
 
     if stops:
-        for start in np.arange(25.0, 600.0, 60.0):
+        for start in rest + np.arange(0.0, 575.0, 60.0):
             speed += rng.uniform(8.0, 16.0) * (ramp(start, 12.0) - ramp(start + 38.0, 10.0))
             for bend in (start + 14.0, start + 25.0):
                 course += float(rng.choice([-1.0, 1.0])) * rng.uniform(0.3, 1.5) * ramp(bend, 8.0)
     else:
-        speed = 15.0 * 0.5 * (1.0 - np.cos(np.pi * np.clip((time - 25.0) / 20.0, 0.0, 1.0)))
-        course = course + 1.5 * ramp(50.0, 12.0) - 2.0 * ramp(75.0, 12.0)
+        speed = 15.0 * 0.5 * (1.0 - np.cos(np.pi * np.clip((time - rest) / 20.0, 0.0, 1.0)))
+        course = course + 1.5 * ramp(rest + 25.0, 12.0) - 2.0 * ramp(rest + 50.0, 12.0)
 
     def integral(rate: Array) -> Array:
         return np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1])) * 0.01])

@@ -13,6 +13,7 @@ from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu, ThermalCorrection, Trajectory
 from stages.navigation import output, quality, states
 from stages.navigation.alignment import Start, align, starting_at
+from stages.navigation.clocks import refuse_jumps
 from stages.navigation.measurements import withheld
 from stages.navigation.settings import NavigationSettings
 from stages.navigation.solve import Problem, Solution, likelihood, solve
@@ -219,7 +220,8 @@ def _repeated(problem: Problem) -> tuple[Solution, int]:
     number = 1
     while True:
         solution = solve(problem)
-        quality.refuse_clock_jump(solution)
+        if number == 1:
+            refuse_jumps(solution)
         attitude = np.linalg.norm(solution.shift(slice(0, 1))[0, states.ATTITUDE])
         late = float(solution.theta()[-1, states.parameter("gnss_latency")][0]) if estimates_latency else 0.0
         rough = attitude >= SETTLED or abs(late) > SETTLED_LATENCY

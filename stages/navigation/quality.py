@@ -4,7 +4,6 @@ Functions
 ---------
 histories           forward sigmas, forward/backward separation and parameters along the flight, while the matrices are there
 assess              all of it, in plain data
-refuse_clock_jump   fixes that part from the path as a jump of a clock makes them
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from pipeline.errors import InputError
 from pipeline.records import DATA_GAP, GNSS_QUALITIES, Gnss, Trajectory
 from stages.navigation import calibration, kalman, states
 from stages.navigation.measurements import withheld
@@ -33,9 +31,6 @@ AXES = ("north", "east", "down")
 SEEN_BACKWARDS = (
     1e-3  # a direction of which the backward filter knows less than this, beside the forward one, has no separation
 )
-JUMP = 0.02  # s: below it a clock's jump is not told from noise
-JUMP_SPEED = 3.0  # m/s
-JUMP_LASTS = 5.0  # s
 
 
 @dataclass(frozen=True)
@@ -365,41 +360,6 @@ def _figures(
         **columns("forward_sigma_deg", along.forward_sigma[:, 6:], 180.0 / np.pi, ("roll", "pitch", "yaw")),
         "parameters": parameters,
     }
-
-
-def refuse_clock_jump(solution: Solution) -> None:
-    """Raise InputError where fixes part from the path, for good, by v·Δt: one of the clocks has jumped.
-
-    Over a run of fixes beyond the gate that lasts five seconds or to the end of the flight, Δt is the least-squares slope of the
-    innovation on the velocity; it is a jump where it explains 90 % of the innovations' squares.
-    """
-    store, gnss, place = solution.store, solution.problem.gnss, solution.gathered.of_fix
-    kept = ~withheld(gnss.time, solution.problem.settings)
-    known = np.flatnonzero(np.isfinite(store.nis[place]) & kept)
-    refused = ((store.verdict[place, 0] == kalman.REJECTED) | store.reentry[place])[known]
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], refused.astype(np.int8), [0]])))
-    for first, stop in zip(edges[::2], edges[1::2], strict=True):
-        run = known[first:stop]
-        last = int(run[-1])
-        comes_back = stop < known.size and not store.reentry[place[last]]
-        if gnss.time[last] - gnss.time[run[0]] < JUMP_LASTS or comes_back:
-            continue
-        y = store.innovation[place[run], :3]
-        k = np.searchsorted(solution.problem.imu.time, solution.gathered.fix_time[run]).clip(0, store.epoch.size - 1)
-        v = store.velocity[k]
-        moving = np.linalg.norm(v, axis=1) > JUMP_SPEED
-        if moving.sum() < 5:
-            continue
-        slope = float((y[moving] * v[moving]).sum() / (v[moving] ** 2).sum())
-        left = float(((y[moving] - slope * v[moving]) ** 2).sum() / (y[moving] ** 2).sum())
-        if abs(slope) > JUMP and left < 0.1:
-            raise InputError(
-                "gnss",
-                "variable 'time'",
-                f"from {gnss.time[run[0]]:.2f} s on, the fixes lie {abs(slope):.2f} s of flight "
-                f"{'ahead of' if slope > 0 else 'behind'} the path of the inertial data: one of the two clocks has jumped there",
-                "correct the stamps of imu or gnss, or make two flights of it",
-            )
 
 
 def _rms(values: Array) -> float:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from pipeline.records import Gnss, Imu
 from stages.navigation.velocity import gnss_velocity
@@ -26,6 +27,8 @@ Array = NDArray[np.float64]
 
 WINDOW = 1.0  # s
 LEAST_CONFIRMED = 3  # windows
+MEDIAN = 31  # windows
+USUAL = 2.0  # times its median at standstill: the unrest that a quiet unit reaches now and then
 APART = 3.0  # the quietest moving windows must be louder than the standing ones by this factor
 SLOWEST = 0.5  # m/s: below it a window never counts as moving
 SUREST = 0.4  # m/s: a fix with a larger sigma of velocity confirms nothing
@@ -87,20 +90,21 @@ def find(imu: Imu, gnss: Gnss, white_noise: float) -> Standstill:
     # The scatter inside a window, and how far the mean rate is from its usual: a slow steady turn is no standstill.
     gyro = np.linalg.norm(spread_gyro, axis=1)
     accel = np.linalg.norm(spread_accel, axis=1)
-    reference = np.median(mean_gyro[confirmed], axis=0)
+    # The usual wanders with the biases, so it is the running median of what confirmed windows say.
+    usual_rate = median_filter(mean_gyro[confirmed], size=(MEDIAN, 1), mode="nearest")
+    at = np.flatnonzero(confirmed)
+    reference = np.stack([np.interp(np.arange(first.size), at, usual_rate[:, i]) for i in range(3)], axis=1)
     turning = np.linalg.norm(mean_gyro - reference, axis=1) / np.sqrt(3.0)
     scale = [float(np.median(v[confirmed])) for v in (gyro, accel, turning)]
-    # Biases wander over a flight, so the mean rate may differ from the median's by more than its scatter.
-    scale[2] = max(scale[2], 0.1 * scale[0])
+    scale[2] = max(scale[2], 0.1 * scale[0])  # between two stops they wander further
     unrest = np.max([v / max(s, 1e-12) for v, s in zip((gyro, accel, turning), scale, strict=True)], axis=0)
-    loudest = float(np.percentile(unrest[confirmed], 90.0))
+    loudest = max(float(np.percentile(unrest[confirmed], 90.0)), USUAL)
     quietest = float(np.percentile(unrest[moving], 1.0)) if moving.any() else np.inf
     if quietest < APART * loudest:
-        # Not parted by the inertial data: only what GNSS itself confirms and is as quiet as the most.
+        # Not parted by the inertial data: only what GNSS itself confirms.
         at_rest = confirmed & (unrest <= loudest)
     else:
-        limit = min(np.sqrt(loudest * quietest), 3.0 * loudest) if np.isfinite(quietest) else 3.0 * loudest
-        at_rest = (unrest <= limit) & ~moving
+        at_rest = (unrest <= min(np.sqrt(loudest * quietest), APART * loudest)) & ~moving
     # A window beside a moving one may hold the first jolt: one is given up at each side.
     inner = at_rest.copy()
     inner[1:] &= at_rest[:-1]
