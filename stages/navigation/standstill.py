@@ -33,7 +33,10 @@ APART = 3.0  # the quietest moving windows must be louder than the standing ones
 SLOWEST = 0.5  # m/s: below it a window never counts as moving
 SUREST = 0.4  # m/s: a fix with a larger sigma of velocity confirms nothing
 DISPLACED = 0.1  # m over the window: a confirmed window moves less, or less than the fixes' own scatter
-DRIFT = 0.02  # m/s: a confirmed window's mean speed is below this, or below GNSS' own uncertainty
+SLOW, DRIFT = (
+    0.25,
+    0.05,
+)  # m/s: a confirmed window's fixes and their mean are slower, or within the receiver's own sigma
 
 
 @dataclass(frozen=True)
@@ -151,7 +154,7 @@ def _by_gnss(
         moved = np.linalg.norm(np.diff(metres[around], axis=0))
         confirmed[i] = bool(
             moved < max(DISPLACED, 3.0 * float(np.linalg.norm(gnss.sigma_position[around])))
-            and (speed[inside] < np.maximum(3.0 * doubt[inside], DRIFT)).all()
+            and (speed[inside] < np.maximum(3.0 * doubt[inside], SLOW)).all()
             and np.linalg.norm(velocity[inside].mean(axis=0))
             < max(DRIFT, 2.0 * float(doubt[inside].mean()) / np.sqrt(b - a))
             and (doubt[inside] < SUREST).all()

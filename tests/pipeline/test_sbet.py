@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from pipeline.errors import InputError
-from pipeline.formats.sbet import DTYPE, from_trajectory, heading, read_sbet, velocity_ned, write_sbet
+from pipeline.formats import smrmsg
+from pipeline.formats.sbet import (
+    DTYPE,
+    from_trajectory,
+    heading,
+    read_sbet,
+    to_trajectory,
+    velocity_ned,
+    write_sbet,
+)
 from pipeline.records import Trajectory
 from tsmftis.geodesy import earth_rate_ned, normal_gravity, radii_of_curvature
 from tsmftis.rotation import log_so3, rpy_to_dcm
@@ -123,6 +132,56 @@ def test_wander_angle_turns_velocity_and_heading_together() -> None:
     records["velocity_x"], records["wander"], records["platform_heading"] = 100.0, 0.3, 0.0
     north, east, _ = velocity_ned(records)[0]
     assert np.arctan2(east, north) == pytest.approx(heading(records)[0]) == pytest.approx(-0.3)
+
+
+def test_records_become_a_trajectory_and_records_again() -> None:
+    """A round trip with all fields drawn at random: equal to rounding, sigmas unknown."""
+    rng = np.random.default_rng(5)
+    records = plain(50)
+    records["time"] += 100.0
+    for name, centre, size in (
+        ("latitude", 0.7, 0.01), ("longitude", 2.0, 0.01), ("height", 500.0, 5.0), ("velocity_x", 60.0, 5.0),
+        ("velocity_y", 10.0, 5.0), ("velocity_z", 0.0, 1.0), ("roll", 0.0, 0.2), ("pitch", 0.0, 0.1),
+        ("platform_heading", 1.0, 0.3), *((f"{k}_{a}", 0.0, 0.1) for k in ("acceleration", "rate") for a in "xyz"),
+    ):  # fmt: skip
+        records[name] = centre + size * rng.standard_normal(records.size)
+    trajectory = to_trajectory(records)
+    assert np.isnan(trajectory.sigma_position).all() and np.isnan(trajectory.sigma_attitude).all()
+    again = from_trajectory(trajectory)
+    for name in DTYPE.names:
+        np.testing.assert_allclose(again[name], records[name], atol=1e-9, err_msg=name)
+
+
+@real_data
+def test_the_aircrafts_wandering_frame_is_taken_into_account() -> None:
+    """Its inertial rates, integrated against Earth rate and the path, must turn it as its attitude does: 1e-6 rad/s.
+
+    The rate of the wander angle is part of that: the file's vertical rate differs by it from that against north, east, down.
+    """
+    records = read_sbet(AIRCRAFT)
+    t = to_trajectory(records)
+    dcm = rpy_to_dcm(*t.rpy.T)
+    turned = log_so3(np.swapaxes(dcm[:-1], 1, 2) @ dcm[1:]) / np.diff(t.time)[:, None]
+    meridian, prime = radii_of_curvature(t.latitude)
+    north, east, _ = t.velocity.T
+    transport = np.stack([east / prime, -north / meridian, -east * np.tan(t.latitude) / prime], -1)
+    against_ned = t.rate - np.einsum("nji,nj->ni", dcm, earth_rate_ned(t.latitude) + transport)
+    off = (against_ned[1:] - turned).mean(axis=0)
+    print("wander", off)
+    assert np.abs(off).max() < 3e-6
+
+
+def test_sigmas_of_an_smrmsg_come_in_between_its_seconds() -> None:
+    trajectory = to_trajectory(plain(5))
+    records = np.zeros(6, smrmsg.DTYPE)
+    records["time"] = np.arange(6) - 0.5
+    records["position_down"], records["heading"] = np.arange(6), 60.0
+    with_them = smrmsg.with_sigmas(trajectory, records, Path("x.smrmsg"))
+    np.testing.assert_allclose(with_them.sigma_position[:, 2], np.arange(5) + 0.5)
+    np.testing.assert_allclose(with_them.sigma_attitude[:, 2], np.deg2rad(1.0))
+    records["time"] += 100.0
+    with pytest.raises(InputError, match=r"x\.smrmsg: time: spans 99\.5 to 104\.5 s"):
+        smrmsg.with_sigmas(trajectory, records, Path("x.smrmsg"))
 
 
 def damaged(name: str, value: float) -> bytes:
