@@ -59,7 +59,11 @@ def _effect(path: Path, name: Any, given: Any, applied: frozenset[str]) -> dict[
     for key, value in given.items():
         if key not in effect.units:
             raise InputError(path, f"{place[:-1]}.{key}'", "is no parameter", f"it has {', '.join(effect.units)}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        try:
+            number = math.nan if isinstance(value, bool) else float(value)  # YAML 1.1 reads 1e-6 as text
+        except (TypeError, ValueError):
+            number = math.nan
+        if not math.isfinite(number):
             raise InputError(path, f"{place[:-1]}.{key}'", f"is {value!r}", f"give a number [{effect.units[key]}]")
-        values[key] = float(value)
+        values[key] = number
     return values

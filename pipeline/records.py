@@ -598,7 +598,9 @@ class Trajectory:
         )
 
     def thinned(self, interval: float) -> Trajectory:
-        """The samples nearest to the first one's time and every `interval` [s] after it."""
+        """The samples nearest to the first one's time and every `interval` [s] after it; all where they come no faster."""
+        if interval <= np.diff(self.time).min(initial=np.inf):
+            return self
         wanted = np.arange(self.time[0], self.time[-1] + 1e-9, interval)
         after = np.clip(np.searchsorted(self.time, wanted), 1, self.time.size - 1)
         nearest = after - (wanted - self.time[after - 1] < self.time[after] - wanted)

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Effect:
-    """The stage whose model it changes, and the unit of each parameter; those in `triples` are lists of three."""
+    """The stage whose model it changes, and the unit of each parameter."""
 
     stage: str
     units: Mapping[str, str]
-    triples: tuple[str, ...] = ()
 
 
 def _axes(unit: str) -> dict[str, str]:
@@ -29,9 +28,7 @@ EFFECTS: Mapping[str, Effect] = {
     "gyro_scale_factor": Effect("navigation", _axes("1")),
     "accel_scale_factor": Effect("navigation", _axes("1")),
     "gyro_g_sensitivity": Effect("navigation", _axes("rad s-1 per m s-2")),
-    "thermal_hysteresis": Effect(
-        "thermal", {"half_width": "K", "gyro": "rad s-1", "accel": "m s-2"}, ("gyro", "accel")
-    ),
+    "thermal_hysteresis": Effect("thermal", {"half_width": "K", "gyro": "rad s-1", "accel": "m s-2"}),
     "thermal_lag": Effect("thermal", {"lag": "s"}),
     "camera_latency": Effect("geometry", {"latency": "s"}),
     "boresight": Effect("geometry", {"roll": "rad", "pitch": "rad", "yaw": "rad"}),

@@ -110,7 +110,7 @@ def from_trajectory(trajectory: Trajectory) -> Records:
     columns = (
         t.time,
         t.latitude,
-        t.longitude,
+        (t.longitude + np.pi) % (2.0 * np.pi) - np.pi,
         t.height,
         north,
         -east,
@@ -145,7 +145,7 @@ def to_trajectory(records: Records) -> Trajectory:
     return Trajectory(
         r["time"].copy(),
         r["latitude"].copy(),
-        r["longitude"].copy(),
+        np.unwrap(r["longitude"]),
         r["height"].copy(),
         velocity,
         rpy,

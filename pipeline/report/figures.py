@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from pipeline.records import Frames, Interferograms, Spectra, Targets, Tracks, Trajectory
-from tsmftis.geodesy import local_metres
+from tsmftis.geodesy import STANDARD_GRAVITY, local_metres
 from tsmftis.inertial import DEG_PER_H, MICRO_G
 
 Array = NDArray[np.float64]
@@ -159,16 +159,16 @@ def separation(quality: dict[str, Any], lines: dict[str, tuple[float, float]]) -
     """Backward minus forward solution, each with the 95 % that their sigmas allow."""
     figure = make_subplots(rows=6, cols=1, shared_xaxes=True, vertical_spacing=0.025)
     time = quality["history_time"]
-    for first, key, scale, unit in ((1, "", 1.0, "m"), (4, "_deg", 1.0, "°")):
+    for first, key, unit in ((1, "", "m"), (4, "_deg", "°")):
         for i, name in enumerate(NED):
             value, sigma = quality[f"separation{key}_{name}"], quality[f"separation_sigma{key}_{name}"]
             known = [j for j, v in enumerate(value) if v is not None]
             at = [time[j] for j in known]
-            band = [1.96 * scale * sigma[j] for j in known]
+            band = [1.96 * sigma[j] for j in known]
             _band(figure, at, [-b for b in band], band, "95 % by the sigmas", first + i, show=first + i == 1)
             figure.add_scatter(
                 x=at,
-                y=[scale * value[j] for j in known],
+                y=[value[j] for j in known],
                 showlegend=False,
                 line={"color": PALETTE[i], "width": 1.3},
                 row=first + i,
@@ -188,7 +188,7 @@ def sensor_errors(quality: dict[str, Any], lines: dict[str, tuple[float, float]]
         "accel_bias": ("accel bias [µg]", 1.0 / MICRO_G),
         "gyro_scale_factor": ("gyro scale [ppm]", 1e6),
         "accel_scale_factor": ("accel scale [ppm]", 1e6),
-        "gyro_g_sensitivity": ("gyro g-sens. [°/h/g]", 9.80665 / DEG_PER_H),
+        "gyro_g_sensitivity": ("gyro g-sens. [°/h/g]", STANDARD_GRAVITY / DEG_PER_H),
         "antenna_lever_arm": ("lever arm [m]", 1.0),
         "gnss_latency": ("latency [ms]", 1e3),
     }

@@ -23,7 +23,7 @@ from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu
 from stages.navigation.mechanisation import turn
 from stages.navigation.standstill import Standstill
-from stages.navigation.velocity import gnss_velocity
+from stages.navigation.velocity import gnss_velocity, moves
 from tsmftis.geodesy import EARTH_RATE, normal_gravity, radii_of_curvature
 from tsmftis.inertial import SensorModel
 from tsmftis.rotation import dcm_to_quaternion, dcm_to_rpy, quaternion_to_dcm, rpy_to_dcm
@@ -93,15 +93,13 @@ def align(
     move faster than `course_speed` [m/s], or from rest by the later course.
 
     The heading is the GNSS course turned by `offset` [rad] (no crab angle: sigma 10° in motion, 20° from rest); the flight's
-    own accelerations refine it, and the filter is run again from the smoothed start. A speed counts only beyond five of its
-    sigmas, so that the scatter of a parked receiver is no course. Raises InputError where the unit never moves fast enough for a
-    course and is too coarse for a gyrocompass.
+    own accelerations refine it, and the filter is run again from the smoothed start. Raises InputError where the unit never
+    moves fast enough for a course and is too coarse for a gyrocompass.
     """
-    velocity, sigma = gnss_velocity(gnss)
+    velocity, _ = gnss_velocity(gnss)
     start = max(float(imu.time[0]), float(gnss.time[0]) - 1.0)
     inside = (gnss.time >= start) & (gnss.time <= imu.time[-1])
-    speed, doubt = np.hypot(velocity[:, 0], velocity[:, 1]), 5.0 * np.hypot(sigma[:, 0], sigma[:, 1])
-    moving = np.flatnonzero(inside & (speed > np.maximum(course_speed, doubt)))
+    moving = np.flatnonzero(inside & moves(gnss, course_speed))
     compass = _gyrocompass(imu, gnss, still, lever, gyro, float(gnss.time[moving[0]]) if moving.size else np.inf)
     if compass is not None:
         return compass
@@ -109,8 +107,8 @@ def align(
         raise InputError(
             "gnss",
             "velocity",
-            f"never exceeds {course_speed:g} m/s, so no heading can be taken from the course",
-            "give flights[].initial in campaign.yaml or lower navigation.course_speed_m_per_s",
+            f"never exceeds {course_speed:g} m/s and five of its own sigmas, so no heading can be taken from the course",
+            "give flights[].initial in campaign.yaml, or lower navigation.course_speed_m_per_s",
         )
     if gnss.time[moving[0]] - start < 2.0:
         return _in_motion(imu, gnss, velocity, int(moving[0]), lever, offset)
@@ -122,8 +120,8 @@ def _gyrocompass(
 ) -> Start | None:
     """Levelling by gravity and heading by the Earth's rotation over the first unbroken standstill, before `moves` [s].
 
-    With the rate levelled, (ω_x, ω_y) = Ω·cos L·(cos yaw, −sin yaw). σ_yaw = √(σ_b² + N²/T)/(Ω·cos L); None where that exceeds
-    5°: consumer and tactical gyros.
+    With the rate levelled, (ω_x, ω_y) = Ω·cos L·(cos yaw, −sin yaw). σ_yaw = √(σ_b² + N²/T)/(Ω·cos L), doubled for what it leaves
+    out; None where that exceeds 5°: consumer and tactical gyros.
     """
     if still.start.size < COMPASS_WINDOWS:
         return None
@@ -136,7 +134,7 @@ def _gyrocompass(
     latitude = float(gnss.latitude[np.argmin(np.abs(gnss.time - first))])
     across = EARTH_RATE * np.cos(latitude)
     sigma_yaw = float(np.sqrt(gyro.bias_sigma**2 + gyro.white_noise**2 / (stop - first)) / across)
-    if sigma_yaw > np.deg2rad(5.0):
+    if 2.0 * sigma_yaw > np.deg2rad(5.0):
         return None
     force, rate = (_mean_over(imu, values, first, stop) for values in (imu.accel, imu.gyro))
     roll, pitch = level(force, np.array([0.0, 0.0, -np.linalg.norm(force)]), 0.0)

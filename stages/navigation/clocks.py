@@ -18,7 +18,7 @@ from stages.navigation import kalman, states
 from stages.navigation.alignment import Start
 from stages.navigation.measurements import withheld
 from stages.navigation.output import sigmas
-from stages.navigation.solve import Solution, likelihood
+from stages.navigation.solve import Solution, misfit
 from tsmftis.geodesy import radii_of_curvature
 from tsmftis.rotation import dcm_to_rpy, exp_so3, quaternion_to_dcm
 
@@ -29,7 +29,8 @@ JUMP_SPEED = 3.0  # m/s
 JUMP_LASTS = 5.0  # s
 SHORTEST_GAP = 0.05  # s: a gap is asked whether it is a jump of the stamps
 BEFORE, AFTER = 20.0, 300.0  # s of flight on which it is asked
-DECISIVE = 50.0  # by which the logarithm of the likelihood must rise
+POOR = 1.3  # times its expectation: a sum of NIS above it says that the gap does not explain the fixes
+DECISIVE = 100.0  # by which the sum of NIS must fall without the gap
 MOST_GAPS = 5  # the longest are asked
 
 
@@ -45,8 +46,9 @@ def refuse_jumps(solution: Solution) -> None:
 def _fixes_part(solution: Solution) -> None:
     """Fixes that lie off the path by v·Δt for good: one of the clocks has jumped.
 
-    Over a run of fixes beyond the gate that lasts five seconds or to the end of the flight, Δt is the least-squares slope of the
-    innovation on the velocity; it is a jump where it explains 90 % of the innovations' squares.
+    Over a run of rejected fixes that lasts five seconds or to the end of the flight, Δt is the least-squares slope of the
+    innovation on the velocity; it is a jump where it explains 90 % of the innovations' squares, and four times better than a
+    shift of the datum would. On a straight line the two cannot be told apart, and the re-entry that follows is reported.
     """
     store, gnss, place = solution.store, solution.problem.gnss, solution.gathered.of_fix
     kept = ~withheld(gnss.time, solution.problem.settings)
@@ -65,9 +67,10 @@ def _fixes_part(solution: Solution) -> None:
         moving = np.linalg.norm(v, axis=1) > JUMP_SPEED
         if moving.sum() < 5:
             continue
-        slope = float((y[moving] * v[moving]).sum() / (v[moving] ** 2).sum())
-        left = float(((y[moving] - slope * v[moving]) ** 2).sum() / (y[moving] ** 2).sum())
-        if abs(slope) > JUMP and left < 0.1:
+        y, v = y[moving], v[moving]
+        slope = float((y * v).sum() / (v**2).sum())
+        as_jump, as_shift = float(((y - slope * v) ** 2).sum()), float(((y - y.mean(axis=0)) ** 2).sum())
+        if abs(slope) > JUMP and as_jump < 0.1 * float((y**2).sum()) and as_jump < 0.25 * as_shift:
             raise InputError(
                 "gnss",
                 "variable 'time'",
@@ -78,7 +81,7 @@ def _fixes_part(solution: Solution) -> None:
 
 
 def _gap_is_one(solution: Solution, k: int) -> None:
-    """The stamps before sample k: do data lack there, or did the clock jump? The likelihood of the fixes around it decides.
+    """The stamps before sample k: do data lack there, or did the clock jump? How well the fixes around it fit decides.
 
     Where the flight is straight it cannot, and nothing is said.
     """
@@ -92,8 +95,9 @@ def _gap_is_one(solution: Solution, k: int) -> None:
     joined = replace(as_it_is, time=np.where(np.arange(first, last) >= k, as_it_is.time - missing, as_it_is.time))
     until = float(joined.time[-1])
     trial = replace(problem, imu=as_it_is, start=_start_at(solution, first), still=problem.still.after(np.inf))
-    gain = likelihood(replace(trial, imu=joined), until) - likelihood(trial, until)
-    if gain > DECISIVE:
+    (lacking, expected), (jumped, _) = misfit(trial, until), misfit(replace(trial, imu=joined), until)
+    # The likelihood would count against the gap that it makes the filter unsure: what counts is whether it fits.
+    if lacking > POOR * expected and lacking - jumped > DECISIVE:
         raise InputError(
             "imu",
             "variable 'time'",

@@ -41,6 +41,8 @@ from stages.navigation.states import NAVIGATION, PARAMETERS, STATES
 FIX, STANDSTILL, HEIGHT = 0, 1, 2
 BELIEVED, WEIGHED_DOWN, REJECTED = 0, 1, 2
 GROSS = 25.0  # times the gate: beyond it position or velocity of a fix is rejected, before it only weighed down
+FEWEST_REFUSED = 5  # rejected positions in a row before the filter doubts itself
+AGREE = 0.5  # of their size: successive rejected innovations that differ by more do not agree
 # Places among the parameters θ; see `states.GROUPS`.
 _BG, _BA, _SG, _SA, _GG, _LEVER, _LATENCY = 0, 3, 6, 9, 12, 15, 18
 
@@ -330,6 +332,11 @@ def _at_fix(fixes: Any, k: int, position: Any, velocity: Any, dcm: Any, theta: A
             H[3 + i, NAVIGATION + _SG + j] = both[i, j] * w[j]
             H[3 + i, NAVIGATION + _GG + j] = both[i, j] * f[j]
             H[3 + i, NAVIGATION + _LEVER + j] = both[i, 3 + j]
+    turned = dcm @ f
+    _cross_into(H, 3, 6, turned[0], turned[1], turned[2], late)
+    for i in range(3):
+        for j in range(NAVIGATION + _LATENCY):
+            H[i, j] -= late * H[3 + i, j]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -354,10 +361,10 @@ def _at_rest(mean_rate: Any, mean_force: Any, lat: float, velocity: Any, dcm: An
 
 @numba.njit(cache=True, nogil=True)
 def _judge(S: Any, y: Any, m: int, gate: float, variance: Any, verdict: Any) -> None:
-    """Position and velocity of a fix, each by its own normalised innovation squared ν = yᵀS⁻¹y over three degrees of freedom.
+    """Position and velocity of a fix (velocity and rotation of a standstill), each by its own ν = yᵀS⁻¹y over three degrees.
 
-    Beyond the gate its variance grows until ν meets the gate; beyond GROSS gates it is rejected. A hard limit alone would lock
-    the filter out: a path that is a little worse than its sigma says rejects every fix that could put it right.
+    Beyond the gate its variance grows so that ν is at most about the gate; beyond GROSS gates it is rejected. A hard limit
+    alone would lock the filter out: a path that is a little worse than its sigma says rejects every fix that could put it right.
     """
     for b in range(m // 3):
         part = slice(3 * b, 3 * b + 3)
@@ -424,8 +431,8 @@ def forward(
 
     active (n,): the states carried. position, velocity, q (w, x, y, z), theta (19,), P0 (n, n): the start, at unit.time[0].
     Measurements are applied at their exact times: an interval with one inside is cut there. gates (7,): by size, the largest
-    normalised innovation squared that is believed (`_judge`); without a position for `reentry_s` the filter doubts itself
-    instead (`_doubt`).
+    normalised innovation squared that is believed (`_judge`); where positions are rejected for `reentry_s` on end and agree
+    with each other, the filter doubts itself instead (`_doubt`).
     """
     time, gyro, accel = unit.time, unit.gyro, unit.accel
     count, n = time.size, active.size
@@ -446,7 +453,7 @@ def forward(
     pack(P, store.epoch_P[0])
     store.epoch_dcm[0], store.epoch_theta[0] = dcm, theta
     store.position[0], store.velocity[0], store.q[0], store.epoch[0] = position, velocity, q, 0
-    last_accepted = time[0]
+    refused, refused_since, refused_y = 0, 0.0, np.zeros(3)
     _correct(gyro[1], accel[1], theta, w0, f0)
     dt0 = time[1] - time[0]
     for k in range(1, count):
@@ -547,23 +554,37 @@ def forward(
                     nis = y[:m] @ np.linalg.solve(S, y[:m])
                     rows = m
                     if kind == FIX:
-                        # What a hypothesis about the start is judged by: no fix counts for more than the gate.
-                        store.loglike[at] = -0.5 * (min(nis, gates[m]) + math.log(np.linalg.det(S)))
                         if measurements.use[at]:
+                            # What a hypothesis about the start is judged by: no fix counts for more than the gate.
+                            store.loglike[at] = -0.5 * (min(nis, gates[m]) + math.log(np.linalg.det(S)))
                             verdict = store.verdict[at]
                             _judge(S, y, m, gates[3], variance, verdict)
-                            if verdict[0] == REJECTED and stop - last_accepted >= reentry_s:
-                                _doubt(P, y, m, stop - last_accepted, velocity)
-                                verdict[:] = BELIEVED
-                                variance[:] = measurements.variance[at]
-                                store.reentry[at] = True
                             if verdict[0] != REJECTED:
-                                last_accepted = stop
-                            rows = 0
-                            for i in range(m):
-                                if verdict[i // 3] != REJECTED:
-                                    H[rows], y[rows], variance[rows] = H[i], y[i], variance[i]
-                                    rows += 1
+                                refused = 0
+                            else:
+                                # A run of rejected positions counts only while they agree with each other.
+                                apart, size = 0.0, 0.0
+                                for i in range(3):
+                                    apart += (y[i] - refused_y[i]) ** 2
+                                    size += y[i] ** 2
+                                    refused_y[i] = y[i]
+                                if refused == 0 or apart > AGREE**2 * size:
+                                    refused, refused_since = 0, stop
+                                refused += 1
+                                if refused >= FEWEST_REFUSED and stop - refused_since >= reentry_s:
+                                    _doubt(P, y, m, stop - refused_since, velocity)
+                                    verdict[:] = BELIEVED
+                                    variance[:] = measurements.variance[at]
+                                    store.reentry[at] = True
+                                    refused = 0
+                    elif kind == STANDSTILL:
+                        _judge(S, y, m, gates[3], variance, store.verdict[at])
+                    if kind != HEIGHT and measurements.use[at]:
+                        rows = 0
+                        for i in range(m):
+                            if store.verdict[at, i // 3] != REJECTED:
+                                H[rows], y[rows], variance[rows] = H[i], y[i], variance[i]
+                                rows += 1
                     accept = measurements.use[at] and rows > 0
                     store.nis[at] = nis
                     store.used[at] = accept

@@ -18,8 +18,9 @@ from stages.navigation.measurements import withheld
 from stages.navigation.settings import NavigationSettings
 from stages.navigation.solve import Problem, Solution, likelihood, solve
 from stages.navigation.standstill import Standstill, find
-from stages.navigation.velocity import gnss_velocity
+from stages.navigation.velocity import moves
 from tsmftis.camera import Mounting
+from tsmftis.effects import EFFECTS
 from tsmftis.geodesy import radii_of_curvature
 from tsmftis.inertial import ImuModel
 from tsmftis.rotation import dcm_to_rpy, exp_so3, quaternion_to_dcm, rpy_to_dcm
@@ -32,9 +33,8 @@ HEADING_SIGMA = np.deg2rad(20.0)  # of each of them
 TRIAL_S = 120.0  # of flight that a heading is tried on
 COURSE_SIGMA = np.deg2rad(40.0)  # how far a vehicle's heading may be from its course, where nothing else tells
 SETTLED = np.deg2rad(0.5)  # a smoothed correction of the first attitude below this needs no further pass
+LOOSE = np.deg2rad(1.0)  # a heading's sigma at the start above which a last pass is made with what is known by then
 SETTLED_LATENCY = 1e-4  # s: 2 % of the period of a 50 Hz vibration, which swings the antenna
-
-Effects = Mapping[str, Mapping[str, float]]
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class NavigationResult:
 
     trajectory: Trajectory
     quality: dict[str, Any]
-    figures: dict[str, list[float]]
+    figures: dict[str, Any]
 
 
 def run(
@@ -55,7 +55,7 @@ def run(
     *,
     initial: tuple[float, Array, Array] | None = None,
     correction: ThermalCorrection | None = None,
-    effects: Effects | None = None,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
 ) -> NavigationResult:
     """Integrate one flight.
 
@@ -81,7 +81,7 @@ def smooth(
     settings: NavigationSettings,
     initial: tuple[float, Array, Array] | None = None,
     correction: ThermalCorrection | None = None,
-    effects: Effects | None = None,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
 ) -> tuple[Solution, int]:
     """Filter and smoother as `run` has them, with all their matrices, and the number of passes."""
     imu = in_body_axes(imu, mounting, correction)
@@ -89,9 +89,15 @@ def smooth(
     _overlap(imu, gnss)
     _bridgeable(imu, settings)
     late = float(theta[states.parameter("gnss_latency")][0])
+    if not settings.use_gnss_velocity:
+        gnss = replace(gnss, velocity=None, sigma_velocity=None)
     kept = _unless(gnss, withheld(gnss.time, settings))
     kept = replace(kept, time=kept.time - late)
-    still = find(imu, kept, model.gyro.white_noise) if settings.standstill_updates else Standstill.none()
+    if kept.time.size < 2:
+        raise InputError(
+            "gnss", "variable 'time'", f"leaves {kept.time.size} fixes that are not withheld", "withhold fewer"
+        )
+    still = find(imu, kept, model.gyro) if settings.standstill_updates else Standstill.none()
     lever = theta[states.parameter("antenna_lever_arm")]
 
     def start_at(offset: float) -> Start:
@@ -115,12 +121,15 @@ def in_body_axes(imu: Imu, mounting: Mounting, correction: ThermalCorrection | N
     return Imu(imu.time, gyro, accel)
 
 
-def declared(mounting: Mounting, effects: Effects) -> Array:
+def declared(mounting: Mounting, effects: Mapping[str, Mapping[str, float]]) -> Array:
     """The parameters θ (19,) as declared: the lever arm, and what a model update adds to it, to the stamps and to the sensors."""
     theta = np.zeros(states.PARAMETERS)
     theta[states.parameter("antenna_lever_arm")] = mounting.imu_to_antenna
     for name, values in effects.items():
-        theta[states.parameter(name)] += [values[key] for key in ("x", "y", "z", "latency") if key in values]
+        order = list(EFFECTS[name].units) if name in EFFECTS and name in states.GROUPS else []
+        if not order or set(values) - set(order):
+            raise ValueError(f"{name}: {dict(values)} is no effect on navigation with parameters {order}")
+        theta[states.parameter(name)] += [values.get(key, 0.0) for key in order]
     return theta
 
 
@@ -166,8 +175,6 @@ def _start(
     offset: float,
 ) -> Start:
     """The start, its heading turned by `offset` [rad] from what the course or `initial` says."""
-    if gnss.time.size < 2:
-        raise InputError("gnss", "variable 'time'", "has no fix that is not withheld", "withhold fewer")
     if initial is None:
         return align(imu, gnss, lever, model.gyro, still, settings.course_speed_m_per_s, offset)
     time, rpy, sigma = initial
@@ -192,10 +199,7 @@ def _surest_heading(problem: Problem, gnss: Gnss, start_at: Callable[[float], St
     if start.sigma_rpy[2] < UNSURE_HEADING:
         return problem
     known = COURSE_SIGMA if aligned else float(start.sigma_rpy[2])
-    velocity, _ = gnss_velocity(gnss)
-    fast = (np.hypot(velocity[:, 0], velocity[:, 1]) > problem.settings.course_speed_m_per_s) & (
-        gnss.time >= start.time
-    )
+    fast = moves(gnss, problem.settings.course_speed_m_per_s) & (gnss.time >= start.time)
     until = float(gnss.time[np.argmax(fast)] if fast.any() else start.time) + TRIAL_S
     best, highest = problem, -np.inf
     for offset in HEADINGS:
@@ -205,12 +209,12 @@ def _surest_heading(problem: Problem, gnss: Gnss, start_at: Callable[[float], St
         value = likelihood(trial, until) - 0.5 * (offset / known) ** 2
         if value > highest:
             best, highest = trial, value
-    if best.start.rpy[2] != start.rpy[2]:
-        turned = np.rad2deg((best.start.rpy[2] - start.rpy[2] + np.pi) % (2 * np.pi) - np.pi)
+    turned = np.rad2deg((best.start.rpy[2] - start.rpy[2] + np.pi) % (2 * np.pi) - np.pi)
+    if abs(turned) > 1.0:
         return replace(
             best, start=replace(best.start, method=f"{start.method}; turned by {turned:.0f}° to fit the fixes")
         )
-    return replace(best, start=replace(best.start, sigma_rpy=np.maximum(start.sigma_rpy, best.start.sigma_rpy)))
+    return best if aligned else problem
 
 
 def _repeated(problem: Problem) -> tuple[Solution, int]:
@@ -224,12 +228,14 @@ def _repeated(problem: Problem) -> tuple[Solution, int]:
             refuse_jumps(solution)
         attitude = np.linalg.norm(solution.shift(slice(0, 1))[0, states.ATTITUDE])
         late = float(solution.theta()[-1, states.parameter("gnss_latency")][0]) if estimates_latency else 0.0
-        rough = attitude >= SETTLED or abs(late) > SETTLED_LATENCY
+        shifted = _shifted(problem.start, solution)
+        loose = problem.start.sigma_rpy[2] > LOOSE and shifted.sigma_rpy[2] < 0.5 * problem.start.sigma_rpy[2]
+        rough = attitude >= SETTLED or loose or abs(late) > SETTLED_LATENCY
         if number == settings.passes or not (rough or (number == 1 and solution.gap.any())):
             return solution, number
         # The prior of position, velocity and attitude moves with the start and keeps its width, which is nothing beside the
         # flight's own information; that of the parameters stays where it was, since it does count.
-        start = _shifted(problem.start, solution.shift(slice(0, 1))[0]) if attitude >= SETTLED else problem.start
+        start = shifted if attitude >= SETTLED or loose else problem.start
         imu = _bridged(solution) if solution.gap.any() else problem.imu
         problem = replace(problem, start=start, imu=imu, latency=problem.latency + late)
         if estimates_latency and _sigma(solution, "gnss_latency") < 0.2 * settings.gnss_latency_sigma_s:
@@ -251,18 +257,21 @@ def _sigma(solution: Solution, group: str) -> float:
 
 def _from(imu: Imu, time: float) -> Imu:
     """The samples after `time`, with a first stamp exactly there: sample 0 is only the start, its rates are not used."""
-    first = int(np.searchsorted(imu.time, time, side="right"))
-    if first == 0:
-        stamps, gyro, accel = (np.concatenate([values[:1], values]) for values in (imu.time, imu.gyro, imu.accel))
-        imu = Imu(stamps, gyro, accel)
-        first = 1
+    first = max(int(np.searchsorted(imu.time, time, side="right")), 1)
     stamps = imu.time[first - 1 :].copy()
     stamps[0] = time
     return Imu(stamps, imu.gyro[first - 1 :], imu.accel[first - 1 :])
 
 
-def _shifted(start: Start, shift: Array) -> Start:
-    """The start moved by a smoothed correction of its position, velocity and attitude."""
+def _shifted(start: Start, solution: Solution) -> Start:
+    """The start moved by the smoothed correction of its position, velocity and attitude.
+
+    Its attitude's sigma comes down to seven of the smoothed ones: with the old one the filter would wander again by degrees
+    before it knows better, and be linearised about that; so tight a prior counts the flight's own information twice by 2 %. A
+    start that has just moved far is not trusted so far: then the sigma stays at least as large as the move.
+    """
+    shift = solution.shift(slice(0, 1))[0]
+    smoothed = output.sigmas(solution.smoothed.covariance[:1], solution.store.epoch_dcm[:1])[0, states.ATTITUDE]
     north, east = radii_of_curvature(start.position[0])
     scale = np.array([north + start.position[2], (east + start.position[2]) * np.cos(start.position[0]), -1.0])
     return replace(
@@ -270,6 +279,7 @@ def _shifted(start: Start, shift: Array) -> Start:
         position=start.position + shift[states.POSITION] / scale,
         velocity=start.velocity + shift[states.VELOCITY],
         rpy=np.array(dcm_to_rpy(exp_so3(shift[states.ATTITUDE]) @ rpy_to_dcm(*start.rpy))),
+        sigma_rpy=np.minimum(start.sigma_rpy, np.maximum(7.0 * smoothed, np.linalg.norm(shift[states.ATTITUDE]))),
     )
 
 

@@ -114,7 +114,7 @@ def assess(
     size = solution.gathered.measurements.size[place]
     kept = ~withheld(gnss.time, problem.settings)
     seen = np.isfinite(nis)
-    residual = antenna_residuals(trajectory, gnss, solution.gathered.fix_time, along)
+    residual = antenna_residuals(trajectory, gnss, along)
     rejected = seen & kept & (verdict == kalman.REJECTED).T
     used = seen & kept & ~rejected[0]  # by their positions
     chosen = residual[used]
@@ -132,13 +132,14 @@ def assess(
         },
         "rejected_times_s": [float(t) for t in gnss.time[rejected.any(axis=0)][:100]],
         "reentries": _reentries(solution),
-        **_innovations(solution, used & ~rejected[1], nis, size),
+        **_innovations(solution, used & ~rejected[1] & ~store.reentry[place], nis, size),
         "position_residual_rms_m": float(np.sqrt((chosen**2).sum(axis=1).mean())) if used.any() else None,
         "position_residual_rms_ned_m": [float(v) for v in np.sqrt((chosen**2).mean(axis=0))] if used.any() else [],
         "separation": _separation(along),
         "imu": _imu(solution),
         "gnss": _gnss(gnss),
         "standstill_s": problem.still.seconds,
+        "standstill_rejected": _standstill_rejected(solution),
         **_gaps(solution),
         "gyro_bias_deg_per_h": (along.theta[:, states.parameter("gyro_bias")].mean(axis=0) / DEG_PER_H).tolist(),
         "accel_bias_ug": (along.theta[:, states.parameter("accel_bias")].mean(axis=0) / MICRO_G).tolist(),
@@ -181,7 +182,7 @@ def _innovations(solution: Solution, used: NDArray[np.bool_], nis: Array, size: 
         "innovation_nis_expected": degrees / count,
         "innovation_nis_band95": [float(low), float(high)],
         "innovation_nis_inside_band": bool(low <= mean <= high),
-        "sigma_of_unit_weight": float(np.sqrt(mean * count / degrees)),
+        "sigma_of_unit_weight": float(np.sqrt(np.median(nis[used] / chi2.median(size[used])))),
         "innovation_nis_by_quality": by_quality,
         "innovation_over_sigma": {
             name: {"mean": float(np.nanmean(z[:, i])), "std": float(np.nanstd(z[:, i]))}
@@ -196,7 +197,13 @@ def _reentries(solution: Solution) -> list[dict[str, float]]:
     store, place, gnss = solution.store, solution.gathered.of_fix, solution.problem.gnss
     at = np.flatnonzero(store.reentry[place])
     distance = np.linalg.norm(store.innovation[place][:, :3], axis=1)
-    return [{"time_s": float(gnss.time[i]), "innovation_m": float(distance[i])} for i in at[:100]]
+    k = np.searchsorted(solution.problem.imu.time, solution.gathered.fix_time[at]).clip(0, store.epoch.size - 1)
+    v = store.velocity[k]
+    along = (store.innovation[place][at, :3] * v).sum(axis=1) / np.maximum((v**2).sum(axis=1), 1e-6)
+    return [
+        {"time_s": float(gnss.time[i]), "innovation_m": float(distance[i]), "seconds_of_flight": float(a)}
+        for i, a in zip(at[:100], along, strict=False)
+    ]
 
 
 def _separation(along: Histories) -> dict[str, Any] | None:
@@ -214,6 +221,12 @@ def _separation(along: Histories) -> dict[str, Any] | None:
         "attitude_ned_sigma_deg": np.rad2deg(sigma[6:]).tolist(),
         "chi2_over_expected": along.separation_chi2,
     }
+
+
+def _standstill_rejected(solution: Solution) -> int:
+    """Standstill windows whose zero velocity or rotation the filter could not believe."""
+    mine = solution.gathered.measurements.kind == kalman.STANDSTILL
+    return int((solution.store.verdict[mine] == kalman.REJECTED).any(axis=1).sum())
 
 
 def _imu(solution: Solution) -> dict[str, float]:
@@ -286,11 +299,10 @@ def _free_inertial(solution: Solution, after: float) -> dict[str, Any]:
     return out
 
 
-def antenna_residuals(trajectory: Trajectory, gnss: Gnss, time: Array, along: Histories) -> Array:
-    """Fix minus smoothed antenna position, NED [m], for fixes at true times (n,) → (n, 3)."""
+def antenna_residuals(trajectory: Trajectory, gnss: Gnss, along: Histories) -> Array:
+    """Fix minus smoothed antenna position, NED [m] (n, 3), with lever arm and latency as finally estimated."""
     lever = along.theta[-1, states.parameter("antenna_lever_arm")]
-    late = time - (gnss.time - along.theta[-1, states.parameter("gnss_latency")][0])
-    time = time - late  # the latency as finally estimated
+    time = gnss.time - along.theta[-1, states.parameter("gnss_latency")][0]
     at = [np.interp(time, trajectory.time, v) for v in (trajectory.latitude, trajectory.longitude, trajectory.height)]
     rpy = [np.interp(time, trajectory.time, np.unwrap(trajectory.rpy[:, i])) for i in range(3)]
     arm = rpy_to_dcm(*rpy) @ lever

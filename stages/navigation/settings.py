@@ -40,10 +40,11 @@ class NavigationSettings(BaseModel):
     g_sensitivity_sigma_deg_per_h_per_g: Positive = Field(
         1.0, description="g-sensitivity of the gyros that is to be expected, where it is estimated"
     )
-    epoch_s: float = Field(0.2, gt=0, le=1.0, description="longest step of the covariance")
+    epoch_s: float = Field(0.2, ge=1e-3, le=1.0, description="longest step of the covariance")
     gate_probability: float = Field(1e-6, gt=0, lt=0.1, description="chance that a good fix is rejected")
     reentry_s: Positive = Field(
-        20.0, description="without a believed fix for so long, the filter doubts itself and takes the next one"
+        20.0,
+        description="where positions that agree with each other are rejected for so long, the filter doubts itself instead",
     )
     sigma_factor: tuple[Positive, Positive, Positive] = Field(
         (1.0, 1.0, 1.0), description="factors on the sigmas of fixed, float and single fixes"
@@ -67,7 +68,7 @@ class NavigationSettings(BaseModel):
         None, description="[period, length]: the last `length` of every `period` seconds is withheld likewise"
     )
     free_inertial_after_s: float | None = Field(
-        None, description="no fix is used after this time; how far they are missed is reported"
+        None, allow_inf_nan=False, description="no fix is used after this time; how far they are missed is reported"
     )
     free_inertial_height_sigma_m: Positive = Field(
         5.0,

@@ -2,9 +2,8 @@
 
 Functions
 ---------
-prepare         inertial data, measurements and their models → what the kernels take
-filter_only     the filter alone over the first part of a flight: how likely its fixes are
-solve           filter and smoother
+solve               filter and smoother
+likelihood, misfit  the filter alone over the first part of a flight: how well it explains the fixes
 """
 
 from __future__ import annotations
@@ -172,13 +171,25 @@ def _filter(problem: Problem) -> tuple[Gathered, NDArray[np.bool_], int, kalman.
     return gathered, gap, count, store
 
 
-def likelihood(problem: Problem, until: float) -> float:
-    """Σ −½(min(NIS, gate) + ln det S) over the fixes up to `until` [s]: how well a start explains them."""
+def _until(problem: Problem, until: float) -> Problem:
     time = problem.imu.time
     stop = int(np.searchsorted(time, until, side="right"))
-    imu = Imu(time[:stop], problem.imu.gyro[:stop], problem.imu.accel[:stop])
-    _, _, _, store = _filter(replace(problem, imu=imu))
+    return replace(problem, imu=Imu(time[:stop], problem.imu.gyro[:stop], problem.imu.accel[:stop]))
+
+
+def likelihood(problem: Problem, until: float) -> float:
+    """Σ −½(min(NIS, gate) + ln det S) over the fixes up to `until` [s]: how well a start explains them."""
+    _, _, _, store = _filter(_until(problem, until))
     return float(store.loglike.sum())
+
+
+def misfit(problem: Problem, until: float) -> tuple[float, float]:
+    """Σ min(NIS, gate) over the fixes up to `until` [s], and its expectation Σ m."""
+    gathered, _, _, store = _filter(_until(problem, until))
+    measurements = gathered.measurements
+    counted = np.isfinite(store.nis) & measurements.use & (measurements.kind == kalman.FIX)
+    gate = np.array([chi2.isf(problem.settings.gate_probability, m) for m in measurements.size[counted]])
+    return float(np.minimum(store.nis[counted], gate).sum()), float(measurements.size[counted].sum())
 
 
 def solve(problem: Problem) -> Solution:

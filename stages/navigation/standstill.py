@@ -21,7 +21,8 @@ from scipy.ndimage import median_filter
 
 from pipeline.records import Gnss, Imu
 from stages.navigation.velocity import gnss_velocity
-from tsmftis.geodesy import local_metres
+from tsmftis.geodesy import EARTH_RATE, local_metres
+from tsmftis.inertial import SensorModel
 
 Array = NDArray[np.float64]
 
@@ -71,10 +72,11 @@ class Standstill:
         return np.asarray((stamps > self.start[window] + 1e-9) & (stamps <= self.stop[window] + 1e-9))
 
 
-def find(imu: Imu, gnss: Gnss, white_noise: float) -> Standstill:
-    """Windows in which the body stands. imu: body axes; white_noise: the gyros' [rad/s/√Hz], the least variance of a mean.
+def find(imu: Imu, gnss: Gnss, gyro: SensorModel) -> Standstill:
+    """Windows in which the body stands. imu: body axes; gyro: the gyros' noise and bias, which bound what a body at rest shows.
 
     A vehicle in smooth flight is quiet too, but never confirmed: without at least three seconds at rest there are no windows.
+    Nor are there any for one that turns on the spot, or hovers: its mean rate is more than Earth rate and bias allow.
     """
     n = imu.time.size
     edges = np.searchsorted(imu.time, np.arange(imu.time[0], imu.time[-1] + WINDOW, WINDOW), side="right")
@@ -88,19 +90,22 @@ def find(imu: Imu, gnss: Gnss, white_noise: float) -> Standstill:
     mean_gyro, spread_gyro = _moments(imu.gyro, first, stop)
     mean_accel, spread_accel = _moments(imu.accel, first, stop)
     confirmed, moving = _by_gnss(imu, gnss, first, stop)
+    # What noise of that size may add to a mean of correlated vibration is taken as a tenth of it.
+    allowed = EARTH_RATE + 4.0 * np.sqrt(3.0) * gyro.bias_sigma + 4.0 * gyro.white_noise / np.sqrt(WINDOW)
+    turns = np.linalg.norm(mean_gyro, axis=1) > allowed + 0.1 * np.linalg.norm(spread_gyro, axis=1)
+    confirmed &= ~turns
     if confirmed.sum() < LEAST_CONFIRMED:
         return Standstill.none()
     # The scatter inside a window, and how far the mean rate is from its usual: a slow steady turn is no standstill.
-    gyro = np.linalg.norm(spread_gyro, axis=1)
-    accel = np.linalg.norm(spread_accel, axis=1)
+    rotation, force = np.linalg.norm(spread_gyro, axis=1), np.linalg.norm(spread_accel, axis=1)
     # The usual wanders with the biases, so it is the running median of what confirmed windows say.
     usual_rate = median_filter(mean_gyro[confirmed], size=(MEDIAN, 1), mode="nearest")
     at = np.flatnonzero(confirmed)
     reference = np.stack([np.interp(np.arange(first.size), at, usual_rate[:, i]) for i in range(3)], axis=1)
     turning = np.linalg.norm(mean_gyro - reference, axis=1) / np.sqrt(3.0)
-    scale = [float(np.median(v[confirmed])) for v in (gyro, accel, turning)]
+    scale = [float(np.median(v[confirmed])) for v in (rotation, force, turning)]
     scale[2] = max(scale[2], 0.1 * scale[0])  # between two stops they wander further
-    unrest = np.max([v / max(s, 1e-12) for v, s in zip((gyro, accel, turning), scale, strict=True)], axis=0)
+    unrest = np.max([v / max(s, 1e-12) for v, s in zip((rotation, force, turning), scale, strict=True)], axis=0)
     loudest = max(float(np.percentile(unrest[confirmed], 90.0)), USUAL)
     quietest = float(np.percentile(unrest[moving], 1.0)) if moving.any() else np.inf
     if quietest < APART * loudest:
@@ -108,13 +113,16 @@ def find(imu: Imu, gnss: Gnss, white_noise: float) -> Standstill:
         at_rest = confirmed & (unrest <= loudest)
     else:
         at_rest = (unrest <= min(np.sqrt(loudest * quietest), APART * loudest)) & ~moving
+    at_rest &= ~turns
     # A window beside a moving one may hold the first jolt: one is given up at each side.
     inner = at_rest.copy()
     inner[1:] &= at_rest[:-1]
     inner[:-1] &= at_rest[1:]
     first, stop = first[inner], stop[inner]
     start, end = imu.time[first - 1], imu.time[stop - 1]
-    variance = np.maximum(spread_gyro[inner] ** 2 / (stop - first)[:, None], (white_noise**2 / (end - start))[:, None])
+    variance = np.maximum(
+        spread_gyro[inner] ** 2 / (stop - first)[:, None], (gyro.white_noise**2 / (end - start))[:, None]
+    )
     return Standstill(start, end, mean_gyro[inner], mean_accel[inner], variance)
 
 

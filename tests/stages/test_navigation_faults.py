@@ -175,7 +175,7 @@ def test_standstill_is_found_where_it_is_and_nowhere_else() -> None:
     """A car in town, engine and road shaking it: at least four fifths of the standing seconds, not one of the moving ones."""
     craft, imu, gnss, _ = recorded("town", MEMS)
     shaken = simulated.shaken(imu, craft, np.random.default_rng(2))
-    still = find(shaken, gnss, MEMS.model.gyro.white_noise)
+    still = find(shaken, gnss, MEMS.model.gyro)
     speed = np.linalg.norm(craft.velocity(shaken.time), axis=1)
     inside = still.holds(shaken.time)
     standing = (speed < 1e-3).mean()
@@ -186,7 +186,7 @@ def test_standstill_is_found_where_it_is_and_nowhere_else() -> None:
 
 def test_no_standstill_in_the_air() -> None:
     _, imu, gnss, _ = recorded("aircraft")
-    assert find(imu, gnss, RLG.model.gyro.white_noise).seconds == 0.0
+    assert find(imu, gnss, RLG.model.gyro).seconds == 0.0
 
 
 COARSE = Grade(
