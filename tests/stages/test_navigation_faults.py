@@ -32,6 +32,9 @@ def perfect(kind: str) -> tuple[flight.Flight, Imu]:
     craft = {
         "aircraft": lambda: simulated.aircraft(0),
         "crabbing": lambda: simulated.flown(LEGS, 3, crab=2.0),
+        "calm": lambda: simulated.flown(
+            [flight.Leg(duration=30.0), flight.Leg(turn=np.pi / 2, bank=0.4), flight.Leg(duration=110.0)], 2, calm=True
+        ),
         "parked": lambda: simulated.drive(rest=600.0),
         "town": lambda: simulated.drive(1, stops=True),
     }[kind]()
@@ -66,7 +69,7 @@ def without(imu: Imu, start: float, stop: float) -> Imu:
 
 
 def test_a_gap_in_a_turn_is_bridged_and_its_sigmas_hold() -> None:
-    """0.5 s missing in a 24 °/s… turn: the second pass puts in what the first one found; then 95 % of errors lie within 2.5 σ.
+    """0.5 s missing in a turn of 4 °/s: the second pass puts in what the first one found; then 95 % of errors lie within 2.5 σ.
 
     The bound is wide since one gap is one draw of a few numbers; without the bridge the worst was 14 σ.
     """
@@ -130,8 +133,8 @@ def test_fixes_that_stay_away_are_taken_in_the_end_and_that_is_said() -> None:
     assert abs(r[:, 2].mean() - 5.0) < 0.1  # down: the path has risen by 5 m with the fixes
 
 
-def test_an_hour_of_float_fixes_is_weighed_as_it_declares() -> None:
-    """0.3 m fixes, quality float: NIS keeps its mean (4 standard errors), σ grows, errors stay within 3 of them."""
+def test_float_fixes_are_weighed_as_they_declare() -> None:
+    """0.3 m fixes, quality float: NIS keeps its mean (4 standard errors), σ grows, errors stay within 4 of them."""
     craft, imu, gnss, initial = recorded("aircraft")
     rng = np.random.default_rng(4)
     offset = 0.3 * rng.standard_normal((gnss.time.size, 3))
@@ -160,7 +163,8 @@ def test_withheld_fixes_are_not_used_and_the_smoother_misses_them_by_less() -> N
     _, imu, gnss, initial = recorded("aircraft", MEMS)
     result = solve(imu, gnss, initial, MEMS, withhold_s=((40.0, 50.0), (70.0, 80.0)))
     missed = result.quality["withheld"]
-    assert missed["fixes"] == result.quality["fixes"]["withheld"] == 100 or missed["fixes"] in (101, 102)
+    inside = ((gnss.time >= 40.0) & (gnss.time <= 50.0)) | ((gnss.time >= 70.0) & (gnss.time <= 80.0))
+    assert missed["fixes"] == result.quality["fixes"]["withheld"] == inside.sum()
     assert missed["horizontal_rms_m"] < 0.7 * missed["forward_horizontal_rms_m"]
     assert missed["miss_over_sigma_rms"] < 1.5
     wild = replace(gnss, height=gnss.height + 100.0 * ((gnss.time >= 70.0) & (gnss.time <= 80.0)))
@@ -172,7 +176,7 @@ def test_withheld_fixes_are_not_used_and_the_smoother_misses_them_by_less() -> N
 
 
 def test_standstill_is_found_where_it_is_and_nowhere_else() -> None:
-    """A car in town, engine and road shaking it: at least four fifths of the standing seconds, not one of the moving ones."""
+    """A car in town, engine and road shaking it: at least four fifths of the standing time, not one of the moving ones."""
     craft, imu, gnss, _ = recorded("town", MEMS)
     shaken = simulated.shaken(imu, craft, np.random.default_rng(2))
     still = find(shaken, gnss, MEMS.model.gyro)
@@ -181,7 +185,7 @@ def test_standstill_is_found_where_it_is_and_nowhere_else() -> None:
     standing = (speed < 1e-3).mean()
     print("standing", standing, "found", inside.mean(), speed[inside].max())
     assert speed[inside].max() < 0.05
-    assert inside.mean() > 0.7 * standing
+    assert inside.mean() > 0.8 * standing
 
 
 def test_no_standstill_in_the_air() -> None:
@@ -269,3 +273,123 @@ def test_free_inertial_mode_reports_how_far_the_fixes_are() -> None:
     assert end["error_m"] > 1.0 and abs(r[0, 2]) < 10.0
     assert "1h" not in result.quality["free_inertial"]
     assert result.quality["fixes"]["used"] < 160
+
+
+# --- what a review found ---------------------------------------------------------------------------------------------
+
+
+def test_one_wild_fix_at_the_end_of_an_outage_is_not_believed() -> None:
+    """25 s without fixes, then one that is 50 m off: rejected, and the good ones after it are taken at once."""
+    craft, imu, gnss, initial = recorded("aircraft")
+    kept = (gnss.time < 50.0) | (gnss.time > 75.0)
+    after = int(np.argmax(gnss.time > 75.0))
+    wild = replace(gnss, height=gnss.height + 50.0 * (np.arange(gnss.time.size) == after))
+    columns = (getattr(wild, n) for n in wild.__dataclass_fields__)
+    result = solve(imu, Gnss(*(c[kept] for c in columns)), initial)
+    assert result.quality["fixes"]["rejected"] == 1 and result.quality["reentries"] == []
+    position, turn = inner_rms(craft, result)
+    assert position < 0.05 and turn < 0.02
+
+
+@pytest.mark.parametrize("rate_deg_per_s", [0.2, 2.0])
+def test_a_body_that_turns_on_the_spot_does_not_stand(rate_deg_per_s: float) -> None:
+    """A hover or a turntable: GNSS says that it stands, but it turns faster than Earth rate and bias allow."""
+    time = np.arange(1, 12001) / 100.0
+    rng = np.random.default_rng(3)
+    turning = np.array([0.0, 0.0, np.deg2rad(rate_deg_per_s)])
+    gyro = turning + MEMS.model.gyro.white_noise * 10.0 * rng.standard_normal((time.size, 3))
+    accel = np.array([0.0, 0.0, -9.8]) + MEMS.model.accel.white_noise * 10.0 * rng.standard_normal((time.size, 3))
+    fix = np.arange(1.0, 119.0, 0.2)
+    still = Gnss(
+        fix,
+        np.full(fix.size, 0.7),
+        np.full(fix.size, 0.2),
+        np.full(fix.size, 50.0),
+        np.full((fix.size, 3), 0.02),
+        0.01 * rng.standard_normal((fix.size, 3)),
+        np.full((fix.size, 3), 0.02),
+        np.ones(fix.size, np.int64),
+    )
+    assert find(Imu(time, gyro, accel), still, MEMS.model.gyro).seconds == 0.0
+    assert find(Imu(time, gyro - turning, accel), still, MEMS.model.gyro).seconds > 100.0
+
+
+@pytest.mark.parametrize("length", [1.0, 3.0, 4.9])
+def test_data_that_are_really_missing_are_no_clock_jump(length: float) -> None:
+    """On a straight line in calm air the two cannot be told apart, so nothing is refused and the gap is reported."""
+    _, imu, gnss, initial = recorded("calm")
+    result = solve(without(imu, 90.0, 90.0 + length), gnss, initial)
+    assert result.quality["imu_gap_count"] == 1
+
+
+@pytest.mark.parametrize("along", [True, False])
+def test_a_datum_that_shifts_on_a_straight_line_is_no_clock_jump(along: bool) -> None:
+    """5 m along the course could be either; across it is none. Both are taken after 20 s and reported with what they would be."""
+    _, imu, gnss, initial = recorded("calm")
+    assert gnss.velocity is not None
+    course = np.arctan2(gnss.velocity[-1, 1], gnss.velocity[-1, 0]) + (0.0 if along else np.pi / 2)
+    late = gnss.time > 90.0
+    shifted = replace(
+        gnss,
+        latitude=gnss.latitude + late * 5.0 * np.cos(course) / 6.36e6,
+        longitude=gnss.longitude + late * 5.0 * np.sin(course) / (6.38e6 * np.cos(gnss.latitude[0])),
+    )
+    (reentry,) = solve(imu, shifted, initial).quality["reentries"]
+    assert reentry["innovation_m"] == pytest.approx(5.0, abs=0.5)
+    assert reentry["seconds_of_flight"] == pytest.approx(5.0 / 60.0 if along else 0.0, abs=0.01)
+
+
+def test_withheld_fixes_do_not_steer_the_alignment_either() -> None:
+    """Without `initial`: changing nothing but withheld fixes changes not a bit of the trajectory."""
+    _, imu, gnss, _ = recorded("crabbing")
+    spans = ((5.0, 25.0), (60.0, 70.0))
+    result = solve(imu, gnss, withhold_s=spans)
+    inside = np.any([(gnss.time >= a) & (gnss.time <= b) for a, b in spans], axis=0)
+    assert gnss.velocity is not None
+    wild = replace(
+        gnss, latitude=gnss.latitude + 1e-4 * inside, velocity=gnss.velocity * np.where(inside, -1.0, 1.0)[:, None]
+    )
+    again = solve(imu, wild, withhold_s=spans)
+    assert again.quality["alignment"] == result.quality["alignment"]
+    np.testing.assert_array_equal(again.trajectory.rpy, result.trajectory.rpy)
+
+
+@pytest.mark.parametrize("settings", [{"withhold_s": ((0.0, 1e9),)}, {"free_inertial_after_s": 0.0}])
+def test_withholding_everything_is_refused(settings: dict[str, Any]) -> None:
+    _, imu, gnss, initial = recorded("aircraft")
+    with pytest.raises(InputError, match="leaves 0 fixes that are not withheld"):
+        solve(imu, gnss, initial, **settings)
+
+
+def test_a_receivers_velocity_that_is_not_used_is_used_nowhere() -> None:
+    """Velocities of zero in flight, switched off: alignment, standstill and filter go by the positions alone."""
+    craft, imu, gnss, _ = recorded("aircraft")
+    assert gnss.velocity is not None
+    lying = replace(gnss, velocity=np.zeros_like(gnss.velocity))
+    result = solve(imu, lying, use_gnss_velocity=False)
+    assert result.quality["fixes"]["rejected"] == 0 and result.quality["standstill_s"] == 0.0
+    position, turn = inner_rms(craft, result)
+    assert position < 0.03 and turn < 0.05
+
+
+def test_single_fixes_without_velocity_align_an_aircraft() -> None:
+    """3 m at 5 Hz, positions alone, no `initial`: within 3 σ of the truth, σ of metres; heading within a degree."""
+    craft, imu, gnss, _ = recorded("aircraft")
+    rng = np.random.default_rng(6)
+    offset = 3.0 * rng.standard_normal((gnss.time.size, 3))
+    coarse = replace(
+        gnss,
+        latitude=gnss.latitude + offset[:, 0] / 6.36e6,
+        longitude=gnss.longitude + offset[:, 1] / (6.38e6 * np.cos(gnss.latitude[0])),
+        height=gnss.height - offset[:, 2],
+        sigma_position=np.full((gnss.time.size, 3), 3.0),
+        velocity=None,
+        sigma_velocity=None,
+        quality=np.full(gnss.time.size, 5, np.int64),
+    )
+    result = solve(imu, coarse)
+    t = simulated.thinned(result.trajectory)
+    r, _, turn = errors(craft, t)
+    scaled = np.concatenate([r / t.sigma_position, turn / t.sigma_attitude], axis=1)
+    print("single", rms(r), np.rad2deg(np.abs(turn).max(axis=0)), np.abs(scaled).max(axis=0))
+    assert np.abs(scaled).max() < 4.0 and np.rad2deg(np.abs(turn[:, 2]).max()) < 1.0
