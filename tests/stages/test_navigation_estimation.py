@@ -246,7 +246,7 @@ def test_the_derivatives_of_both_measurements_are_those_of_their_innovations() -
 def test_the_transition_is_the_derivative_of_the_mechanisation() -> None:
     """One epoch of 0.2 s at 100 Hz from displaced starts, by central differences, against the filter's Φ.
 
-    Rates and forces vary inside the epoch: attitude follows the mean to 0.3 %, velocity to 1 %, position to 3 %.
+    Rates and forces vary inside the epoch: attitude follows the mean to 0.3 %, single and double integrals to 3 %.
     """
     time = np.arange(0, 21) / 100.0
     gyro = np.array([0.1, -0.05, 0.2]) + 0.05 * np.sin(20.0 * time[:, None] + np.arange(3))
@@ -277,7 +277,7 @@ def test_the_transition_is_the_derivative_of_the_mechanisation() -> None:
         change = np.concatenate([(r1 - r0) * simulated.metres(r0[None])[0], v1 - v0, log_so3(c1 @ c0.T)]) / (2.0 * h)
         # Position, velocity and attitude each by its own size: they are seconds apart.
         for part in (slice(0, 3), slice(3, 6), slice(6, 9)):
-            floor, loose = {0: (0.5, 3e-2), 3: (0.05, 1e-2), 6: (1e-6, 3e-3)}[part.start]
+            floor, loose = {0: (0.5, 3e-2), 3: (0.05, 3e-2), 6: (1e-6, 3e-3)}[part.start]
             size = max(np.abs(phi[part, i]).max(), floor)
             assert np.abs(change[part] - phi[part, i]).max() < loose * size + 2e-8, (
                 i,
