@@ -129,7 +129,7 @@ def _consistency(seed: int) -> dict[str, tuple[Array, Array, Array, Array, Array
         initial = simulated.attitude_known_to(craft, grade.sigma_rpy, rng)
         solution, _ = pos.smooth(imu, gnss, grade.model, MOUNTING, NavigationSettings(), initial)
         ahead, after, _, _ = simulated.consistency(craft, solution, AT)
-        t = simulated.thinned(output.trajectory(solution), 50)
+        t = simulated.thinned(output.trajectory(solution, []), 50)
         r, v, rotation = simulated.errors(craft, t)
         scaled = np.concatenate(
             [r / t.sigma_position, v / t.sigma_velocity, _rpy(t.rpy, rotation) / t.sigma_attitude], 1
@@ -181,7 +181,7 @@ def _outages(seed: int) -> tuple[Array, Array]:
     initial = simulated.attitude_known_to(craft, RLG.sigma_rpy, rng)
     settings = NavigationSettings(withhold_s=OUTAGES)
     solution, _ = pos.smooth(imu, gnss, RLG.model, MOUNTING, settings, initial)
-    trajectory = output.trajectory(solution)
+    trajectory = output.trajectory(solution, [])
     store, stamps = solution.store, solution.problem.imu.time
     ends = np.array([int(np.searchsorted(stamps, stop)) - 2 for _, stop in OUTAGES])
     spans = [slice(*np.searchsorted(stamps, span)) for span in OUTAGES]

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from pipeline.campaign import validate
 from pipeline.errors import InputError
+from pipeline.yaml_file import load_yaml
 from stages.bench import BenchSettings
 from stages.mapping import MappingSettings
 from stages.navigation import NavigationSettings
@@ -37,14 +38,7 @@ def load_settings(file: Path | None, assignments: list[str]) -> Settings:
     """Settings from a file (or the defaults), then `stage.key=value` assignments, values read as YAML."""
     content: dict[str, Any] = {}
     if file is not None:
-        try:
-            content = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-        except OSError as error:
-            raise InputError(
-                file, "file", f"cannot be read ({error.strerror})", "give an existing settings file"
-            ) from error
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise InputError(file, "file", "is not valid YAML", "correct the syntax") from error
+        content = load_yaml(file, "give an existing settings file") or {}
         if not isinstance(content, dict):
             raise InputError(file, "file", "holds no keys", "write stage: {key: value}")
     where = file or "--set"

@@ -6,6 +6,7 @@ whether it has to run at all. No science here, and no Prefect: `flows.campaign` 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -150,6 +151,8 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         "time_scale": campaign.keys.time.scale,
         "source": f"tsmftis {__version__}",
     }
+    if update := plan.effects("navigation"):
+        about["model_update"] = json.dumps(update, sort_keys=True)
     if compensated := campaign.keys.thermal is not None and _has_temperatures(campaign, flight):
         inputs["model"] = _needed(model, "thermal")
         outputs["correction"] = f"{flight}/thermal.nc"

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError, field_validator
 
 from pipeline import records
 from pipeline.errors import InputError
+from pipeline.yaml_file import load_yaml
 from tsmftis.camera import Camera, Mounting
 from tsmftis.inertial import DEG_PER_H, MICRO_G, ImuModel, SensorModel
 from tsmftis.interferometer import Interferometer
@@ -52,7 +52,7 @@ class TimeKeys(Strict):
 class InitialKeys(Strict):
     time_s: Finite
     roll_deg: Finite
-    pitch_deg: Finite
+    pitch_deg: Annotated[float, Field(ge=-85.0, le=85.0)]
     yaw_deg: Finite
     sigma_roll_deg: Positive
     sigma_pitch_deg: Positive
@@ -297,14 +297,7 @@ def read_campaign(folder: Path) -> Campaign:
 
 
 def _validated(model: type[Any], path: Path) -> Any:
-    if not path.is_file():
-        raise InputError(path, "file", "does not exist", "a campaign needs it: see the campaign format")
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"line {mark.line + 1}" if mark else "file"
-        raise InputError(path, place, "is not valid YAML", "correct the syntax") from error
+    content = load_yaml(path, "a campaign needs it: see the campaign format")
     return validate(model, content, path)
 
 

@@ -46,7 +46,7 @@ LABELS: Mapping[str, tuple[str, ...]] = {
 def open_dataset(path: Path) -> xr.Dataset:
     """Open a NetCDF-4 file or Zarr store; raises InputError where it is absent or unreadable."""
     if not path.exists():
-        raise InputError(path, "file", "does not exist", "put it there or correct the name in campaign.yaml")
+        raise InputError(path, "file", "does not exist", "put it there or correct its name")
     try:
         if path.is_dir():
             return xr.open_zarr(path, chunks=None, decode_times=False, consolidated=False)

@@ -201,7 +201,7 @@ def _describe_chamber(part: str, chamber: Chamber, found: Inspection) -> None:
 
 def _describe_imu(part: str, imu: Imu, nominal: float, found: Inspection) -> None:
     step = np.diff(imu.time)
-    rate = 1.0 / float(np.median(step))
+    rate = step.size / float(np.ptp(imu.time))
     gaps = int((step > DATA_GAP * np.median(step)).sum())
     found.add(
         part,

@@ -14,9 +14,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from pipeline.errors import InputError
+from pipeline.yaml_file import load_yaml
 from tsmftis.effects import EFFECTS
 
 FORMAT = "tsmftis-model-update/1"
@@ -25,12 +24,7 @@ Effects = dict[str, dict[str, float]]
 
 def read_model_update(path: Path, applied: frozenset[str]) -> Effects:
     """Effects by name, every parameter given; raises InputError for what is no effect, or of a stage that is not `applied`."""
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(path, "file", f"cannot be read ({error.strerror})", "give an existing model update") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(path, "file", "is not valid YAML", "correct the syntax") from error
+    content = load_yaml(path, "give an existing model update")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(path, "key 'format'", f"is not {FORMAT}", f"write  format: {FORMAT}")
     if unknown := sorted(set(content) - {"format", "effects"}):
@@ -65,5 +59,8 @@ def _effect(path: Path, name: Any, given: Any, applied: frozenset[str]) -> dict[
             number = math.nan
         if not math.isfinite(number):
             raise InputError(path, f"{place[:-1]}.{key}'", f"is {value!r}", f"give a number [{effect.units[key]}]")
+        if abs(number) > effect.largest[key]:
+            problem = f"is {number:g}, more than {effect.largest[key]:g} {effect.units[key]}"
+            raise InputError(path, f"{place[:-1]}.{key}'", problem, "correct the value or its unit")
         values[key] = number
     return values

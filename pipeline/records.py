@@ -70,6 +70,15 @@ def _inertial(dataset: xr.Dataset, path: Path) -> tuple[Array, Array, Array]:
             f"reaches {fastest:.4g} rad s-1, more than eleven hundred degrees a second",
             "the values are probably in deg s-1: convert them",
         )
+    for name, values, limit, unit in (("gyro", gyro, 100.0, "rad s-1"), ("accel", accel, 1000.0, "m s-2")):
+        worst = int(np.argmax(np.abs(values).max(axis=1)))
+        if (peak := float(np.abs(values[worst]).max())) > limit:
+            raise InputError(
+                path,
+                f"variable '{name}'",
+                f"is {peak:.4g} {unit} at record {worst}, beyond {limit:g}",
+                "no unit measures that: remove the sample, or correct it",
+            )
     return time, gyro, accel
 
 
@@ -172,7 +181,7 @@ class Gnss:
             time = take_time(dataset, path)
             latitude = take(dataset, path, "latitude", ("time",), "degrees_north")
             longitude = take(dataset, path, "longitude", ("time",), "degrees_east")
-            _in_range(latitude, -90.0, 90.0, path, "variable 'latitude'", "degrees_north")
+            _in_range(latitude, -89.9, 89.9, path, "variable 'latitude'", "degrees_north")
             _in_range(longitude, -180.0, 360.0, path, "variable 'longitude'", "degrees_east")
             height = take(dataset, path, "height", ("time",), "m")
             sigma_position = take(dataset, path, "sigma_position", ("time", "ned"), None, shape=(None, 3))
@@ -549,7 +558,7 @@ class Trajectory:
         return xr.Dataset(
             {
                 "latitude": (time, deg(self.latitude), {"units": "degrees_north"}),
-                "longitude": (time, deg(self.longitude), {"units": "degrees_east"}),
+                "longitude": (time, (deg(self.longitude) + 180.0) % 360.0 - 180.0, {"units": "degrees_east"}),
                 "height": (time, self.height, {"units": "m", "long_name": "height above the WGS-84 ellipsoid"}),
                 "velocity": (ned, self.velocity, {"units": "m s-1"}),
                 "roll": (time, deg(self.rpy[:, 0]), {"units": "degrees"}),
@@ -580,7 +589,7 @@ class Trajectory:
             return cls(
                 take_time(d, path),
                 np.deg2rad(take(d, path, "latitude", ("time",), "degrees_north")),
-                np.deg2rad(take(d, path, "longitude", ("time",), "degrees_east")),
+                np.unwrap(np.deg2rad(take(d, path, "longitude", ("time",), "degrees_east"))),
                 take(d, path, "height", ("time",), "m"),
                 take(d, path, "velocity", ("time", "ned"), "m s-1"),
                 np.stack([angle["roll"], angle["pitch"], (angle["yaw"] + np.pi) % (2 * np.pi) - np.pi], axis=1),
@@ -598,13 +607,13 @@ class Trajectory:
         )
 
     def thinned(self, interval: float) -> Trajectory:
-        """The samples nearest to the first one's time and every `interval` [s] after it; all where they come no faster."""
+        """The samples nearest to the first one's time, every `interval` [s] after it, and the last; all if they come slower."""
         if interval <= np.diff(self.time).min(initial=np.inf):
             return self
         wanted = np.arange(self.time[0], self.time[-1] + 1e-9, interval)
         after = np.clip(np.searchsorted(self.time, wanted), 1, self.time.size - 1)
         nearest = after - (wanted - self.time[after - 1] < self.time[after] - wanted)
-        return self._at(np.unique(nearest))
+        return self._at(np.unique(np.append(nearest, self.time.size - 1)))
 
     def _at(self, index: slice | NDArray[np.int64]) -> Trajectory:
         return Trajectory(**{f.name: getattr(self, f.name)[index] for f in fields(self)})

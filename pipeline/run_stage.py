@@ -209,6 +209,10 @@ def _source_digest(module: str) -> str:
     return _digest_text(Path(spec.origin).read_text(encoding="utf-8")) if spec and spec.origin else ""
 
 
+# CPython before 3.11.9 counts the parser's depth for all threads together and may raise where two of them parse at once.
+_PARSING = threading.Lock()
+
+
 @cache
 def code_digest(module: str) -> str:
     """Digest of a module's source and of every module of this project that it reaches by import."""
@@ -224,7 +228,8 @@ def code_digest(module: str) -> str:
         seen[name] = _digest_text(source)
         if "." in name:
             todo.append(name.rpartition(".")[0])
-        todo.extend(_imports(ast.parse(source)))
+        with _PARSING:
+            todo.extend(_imports(ast.parse(source)))
     return _digest_text(json.dumps(sorted(seen.items())))
 
 

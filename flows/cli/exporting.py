@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,7 @@ import typer
 from rich.console import Console
 
 from flows.cli.importing import writable
+from pipeline.datasets import open_dataset
 from pipeline.errors import InputError
 from pipeline.records import Trajectory
 
@@ -46,11 +48,25 @@ def export_kml(trajectory: Source, out: Out, rate: Rate = 1.0) -> None:
 
 
 @app.command("sbet")
-def export_sbet(trajectory: Source, out: Out, rate: Rate = None) -> None:
-    """Write an SBET (17 little-endian float64 a record)."""
+def export_sbet(
+    trajectory: Source,
+    out: Out,
+    rate: Rate = None,
+    week: Annotated[
+        bool, typer.Option("--seconds-of-week", help="Times in seconds of the GPS week, as other programs expect.")
+    ] = False,
+) -> None:
+    """Write an SBET (17 little-endian float64 a record); times are seconds after the campaign's epoch unless told otherwise."""
     from pipeline.formats import sbet
+    from pipeline.formats.rtklib import seconds_of_week
 
-    _export(trajectory, out, rate, lambda record, path: sbet.write_sbet(sbet.from_trajectory(record), path))
+    def write(record: Trajectory, path: Path) -> None:
+        if week:
+            with open_dataset(trajectory) as d:
+                record = replace(record, time=seconds_of_week(record.time, d.attrs.get("epoch"), trajectory))
+        sbet.write_sbet(sbet.from_trajectory(record), path)
+
+    _export(trajectory, out, rate, write)
 
 
 @app.command("smrmsg")
@@ -70,6 +86,8 @@ def _export(source: Path, out: Path, rate: float | None, write: Callable[[Trajec
     writable(out)
     if source.resolve() == out.resolve():
         raise InputError(out, "OUT", "is the trajectory itself", "give another name")
+    if source.suffix in (".sbet", ".out"):
+        raise InputError(source, "file", "is no trajectory.nc", "turn it into one first: tsmftis import sbet")
     record = Trajectory.from_file(source)
     if rate is not None:
         record = record.thinned(1.0 / rate)

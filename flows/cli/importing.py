@@ -92,7 +92,7 @@ def import_sbet(
 def writable(out: Path) -> None:
     """Raise InputError where `out` cannot be a new file."""
     if out.is_dir() or not out.parent.is_dir():
-        raise InputError(out, "OUT", "is not a file name in an existing folder", "give for instance bench/sample.nc")
+        raise InputError(out, "OUT", "is not a file name in an existing folder", "make the folder or give another name")
 
 
 def _write(dataset: xr.Dataset, out: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +16,7 @@ from rich.table import Table
 
 from flows.settings import load_settings
 from flows.steps import STAGES, UPDATED, Plan
-from pipeline.campaign import read_campaign
+from pipeline.campaign import Campaign, read_campaign
 from pipeline.errors import InputError
 from pipeline.inspect import check_campaign
 from pipeline.model_update import read_model_update
@@ -80,6 +82,7 @@ def run(
         raise InputError(out, "--out", "is a file", "give a folder")
     if plan.campaign.is_relative_to(plan.out) or plan.out.is_relative_to(plan.campaign):
         raise InputError(out, "--out", "would write into the campaign's own place", "give another folder")
+    _belongs(plan, opened.keys.name, out)
     inspection = check_campaign(opened)
     for warning in inspection.warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False)
@@ -88,6 +91,17 @@ def run(
     except OSError as error:
         raise InputError(out, "--out", f"cannot be made ({error.strerror})", "give another folder") from error
 
+    try:
+        with _alone(plan, out):
+            _process(plan, opened, inspection.warnings, dask, console)
+    finally:
+        # Where nothing came of the run, nothing is left of it either.
+        with contextlib.suppress(OSError):
+            plan.out.rmdir()
+
+
+def _process(plan: Plan, opened: Campaign, warnings: list[str], dask: str | None, console: Console) -> None:
+    """Run the flow, write run.json and the report, print the scores; raises what the command ends with."""
     started = time.perf_counter()
     # Prefect takes seconds to import: bad input has been answered by now.
     from flows.campaign import run_campaign
@@ -104,22 +118,54 @@ def run(
     records = run_campaign(plan, say, dask)
     wrong_input = next((record.problem for record in records if isinstance(record.problem, InputError)), None)
     if wrong_input and not any(record.status == "done" and not record.cached for record in records):
-        # Nothing came of the run, so nothing is left of it either.
-        with contextlib.suppress(OSError):
-            plan.out.rmdir()
         raise wrong_input
     # In the order that run.json has, so that report and table do not hang on what was computed and what was read back.
     content = json.loads(json.dumps(assemble(plan, records), sort_keys=True))
     write_run(plan, content)
+    if plan.update:
+        console.print(f"model update: {', '.join(plan.update)}", markup=False)
     ran = sum(record.status == "done" and not record.cached for record in records)
     console.print(f"ran {ran} of {len(records)} stages; writing the report", markup=False)
-    report = write_report(opened, plan.out, content, settings.model_dump(mode="json"), inspection.warnings)
+    report = write_report(opened, plan.out, content, plan.settings.model_dump(mode="json"), warnings)
     print_scores(console, content)
+    for flight, entry in content["flights"].items():
+        for said in (entry["navigation"] or {}).get("warnings", []):
+            console.print(f"warning: flight {flight}: {said}", style="yellow", markup=False)
     console.print(f"report: {_short(report)}   ({time.perf_counter() - started:.0f} s)", markup=False)
     if wrong_input:
         raise wrong_input
     if any(record.status == "failed" for record in records):
         raise typer.Exit(1)
+
+
+def _belongs(plan: Plan, name: str, out: Path) -> None:
+    """A folder holds the results of one campaign: another's would be overwritten where ids are alike, and mixed elsewhere."""
+    try:
+        before = json.loads((plan.out / "run.json").read_text(encoding="utf-8")).get("campaign")
+    except (OSError, ValueError):
+        return
+    if before != name:
+        raise InputError(
+            out,
+            "--out",
+            f"holds results of the campaign '{before}', not of '{name}'",
+            "give another folder, or remove it",
+        )
+
+
+@contextlib.contextmanager
+def _alone(plan: Plan, out: Path) -> Iterator[None]:
+    """One run at a time in a folder; the lock goes with the process, however it ends."""
+    path = plan.out / ".lock"
+    with path.open("w") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise InputError(out, "--out", "is in use by another run", "wait for it or give another folder") from error
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def print_scores(console: Console, content: dict[str, Any]) -> None:

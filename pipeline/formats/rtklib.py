@@ -16,6 +16,7 @@ import datetime as dt
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.records import Gnss
@@ -136,3 +137,13 @@ def _gps_seconds(first: str, second: str, utc: bool) -> float:
     if utc:
         seconds += next((leap for since, leap in LEAP_SECONDS if moment >= since), 14)
     return seconds
+
+
+def seconds_of_week(time: NDArray[np.float64], epoch: str | None, where: Path) -> NDArray[np.float64]:
+    """Seconds after an epoch (ISO date, GPS time) as seconds of the GPS week in which the first of them lies; they run on past
+    its end. Raises InputError where the file at `where` tells no epoch."""
+    if not epoch:
+        raise InputError(where, "attribute 'epoch'", "is missing", "leave --seconds-of-week out: its times are its own")
+    start = (dt.datetime.fromisoformat(epoch.replace("Z", "")).replace(tzinfo=None) - GPS_EPOCH).total_seconds()
+    first = start + float(time[0])
+    return np.asarray(time + start - first // WEEK * WEEK)

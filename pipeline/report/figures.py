@@ -65,6 +65,8 @@ def trajectory_map(
     figure = go.Figure()
     along, right = thin(ned[:, 0], ned[:, 1])
     figure.add_scatter(x=right, y=along, mode="lines", name="flight", line={"color": "#777", "width": 1.5})
+    triangle = {"symbol": "triangle-up", "size": 10, "color": "#777"}
+    figure.add_scatter(x=right[:1], y=along[:1], mode="markers", name="start", marker=triangle)
     for name, (start, stop) in lines.items():
         inside = (trajectory.time >= start) & (trajectory.time <= stop)
         n, e = thin(ned[inside, 0], ned[inside, 1])
@@ -149,7 +151,7 @@ def navigation_quality(
     for row, name in enumerate(("σ position [m]", "σ attitude [°]", "fix − path [m]", "NIS / expected [1]"), start=1):
         figure.update_yaxes(title=name, row=row, col=1)
         if row != 3:
-            figure.update_yaxes(type="log", exponentformat="none", row=row, col=1)
+            figure.update_yaxes(type="log", dtick=1, exponentformat="none", row=row, col=1)
     _shade(figure, lines)
     figure.update_xaxes(title="time [s after the epoch]", exponentformat="none", separatethousands=False, row=4, col=1)
     return layout(figure, 820)

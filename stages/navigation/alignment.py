@@ -3,6 +3,7 @@
 Functions
 ---------
 starting_at     a known attitude, position and velocity from the nearest fix
+heading_at_rest what a heading can be known to without motion
 align           self-alignment: at rest by gyrocompassing (levelling by gravity, heading by the Earth's rotation), in motion
                 (levelling by GNSS acceleration, heading by GNSS course), or from rest (levelling at standstill, heading by the
                 course once the vehicle moves, carried back by the gyros)
@@ -24,12 +25,13 @@ from pipeline.records import Gnss, Imu
 from stages.navigation.mechanisation import turn
 from stages.navigation.standstill import Standstill
 from stages.navigation.velocity import gnss_velocity, moves
-from tsmftis.geodesy import EARTH_RATE, normal_gravity, radii_of_curvature
+from tsmftis.geodesy import EARTH_RATE, local_metres, normal_gravity, radii_of_curvature
 from tsmftis.inertial import SensorModel
 from tsmftis.rotation import dcm_to_quaternion, dcm_to_rpy, quaternion_to_dcm, rpy_to_dcm
 
 Array = NDArray[np.float64]
 
+NEIGHBOURS = 11  # fixes that a start is told by
 COMPASS_WINDOWS = 20  # s: least standstill for a gyrocompass
 COMPASS_LONGEST = 300.0  # s: beyond it, biases wander
 
@@ -55,7 +57,7 @@ def starting_at(time: float, rpy: Array, sigma_rpy: Array, gnss: Gnss, lever: Ar
     0.1 m/s because the lever arm stands on the initial attitude.
     """
     velocity, sigma_velocity = gnss_velocity(gnss)
-    i = int(np.argmin(np.abs(gnss.time - time)))
+    i = int(np.argmin(np.where(_wild(gnss, time), np.inf, np.abs(gnss.time - time))))
     dt = time - gnss.time[i]
     north, east = radii_of_curvature(gnss.latitude[i])
     offset = velocity[i] * dt - rpy_to_dcm(*rpy) @ lever
@@ -69,6 +71,33 @@ def starting_at(time: float, rpy: Array, sigma_rpy: Array, gnss: Gnss, lever: Ar
     sigma_position = np.sqrt(gnss.sigma_position[i] ** 2 + (2.5 * dt * dt) ** 2 + 0.1**2)
     sigma = np.sqrt(sigma_velocity[i] ** 2 + (5.0 * dt) ** 2 + 0.1**2)
     return Start(time, position, velocity[i], rpy, sigma_position, sigma, sigma_rpy, method)
+
+
+def _wild(gnss: Gnss, time: float) -> NDArray[np.bool_]:
+    """Which of the eleven fixes nearest to `time` disagree with the rest of them (n,), so that none of them starts a flight.
+
+    Position and velocity are held against the median of the others' positions carried to the fix by the median velocity, within
+    10 m (m/s) and ten sigmas; none is wild where none agrees.
+    """
+    near = np.argsort(np.abs(gnss.time - time))[:NEIGHBOURS]
+    velocity, sigma_velocity = gnss_velocity(gnss)
+    at = local_metres(
+        gnss.latitude[near],
+        gnss.longitude[near],
+        gnss.height[near],
+        *(float(np.median(v[near])) for v in (gnss.latitude, gnss.longitude, gnss.height)),
+    )
+    v, elapsed = velocity[near], gnss.time[near] - time
+    typical = np.median(v, axis=0)
+    carried = at - typical * elapsed[:, None]
+    off = np.abs(carried - np.median(carried, axis=0))
+    # A vehicle may change its velocity meanwhile, by some 5 m/s².
+    slack = 2.5 * elapsed[:, None] ** 2
+    fits = (off <= 10.0 + 10.0 * gnss.sigma_position[near] + slack).all(axis=1)
+    fits &= (np.abs(v - typical) <= 10.0 + 10.0 * sigma_velocity[near] + 5.0 * np.abs(elapsed[:, None])).all(axis=1)
+    out = np.zeros(gnss.time.size, np.bool_)
+    out[near] = ~fits & fits.any()
+    return out
 
 
 def level(force_body: Array, force_ned: Array, yaw: float) -> tuple[float, float]:
@@ -100,6 +129,8 @@ def align(
     start = max(float(imu.time[0]), float(gnss.time[0]) - 1.0)
     inside = (gnss.time >= start) & (gnss.time <= imu.time[-1])
     moving = np.flatnonzero(inside & moves(gnss, course_speed))
+    if moving.size:
+        moving = moving[~_wild(gnss, float(gnss.time[moving[0]]))[moving]]
     compass = _gyrocompass(imu, gnss, still, lever, gyro, float(gnss.time[moving[0]]) if moving.size else np.inf)
     if compass is not None:
         return compass
@@ -144,6 +175,18 @@ def _gyrocompass(
     rpy = np.array([roll, pitch, np.arctan2(-east, north)])
     sigma = np.array([np.deg2rad(0.5), np.deg2rad(0.5), 2.0 * sigma_yaw])
     return starting_at(float(first), rpy, sigma, gnss, lever, "from rest: levelling and gyrocompassing")
+
+
+def heading_at_rest(gnss: Gnss, gyro: SensorModel, course_speed: float) -> float:
+    """What the Earth's rotation alone tells of a heading, σ [rad], where the receiver never moves; 0 where it does.
+
+    A filter at rest takes changes of its own linearisation for news of the heading, so its sigma must not fall below this.
+    """
+    if moves(gnss, course_speed).any():
+        return 0.0
+    across = EARTH_RATE * np.cos(float(np.median(gnss.latitude)))
+    span = max(float(np.ptp(gnss.time)), 1.0)
+    return float(np.sqrt(gyro.bias_sigma**2 + gyro.white_noise**2 / span) / across)
 
 
 def _mean_over(imu: Imu, values: Array, start: float, stop: float) -> Array:

@@ -49,16 +49,17 @@ _BG, _BA, _SG, _SA, _GG, _LEVER, _LATENCY = 0, 3, 6, 9, 12, 15, 18
 
 class Unit(NamedTuple):
     """The inertial unit: stamps (n,) [s], the first only the start; gyro, accel (n, 3), means over the interval that ends at the
-    stamp, body axes; gap, still (n,): whether that interval is a gap in the data, or the body stood; spectral densities
-    [unit²/s] (28,) of the states' noise, of what a gap adds, and at standstill; inverse correlation times (6,) [1/s]."""
+    stamp, body axes; gap, still (n,): whether that interval is a gap in the data, or the body stood; `unseen` (n, 2): variances
+    per second of rotation [rad²/s] and velocity [m²/s³] for what lacks in an interval; spectral densities [unit²/s] (28,) of the
+    states' noise, and at standstill; inverse correlation times (6,) [1/s]."""
 
     time: Any
     gyro: Any
     accel: Any
     gap: Any
     still: Any
+    unseen: Any
     noise: Any
-    gap_noise: Any
     still_noise: Any
     inverse_tau: Any
 
@@ -445,7 +446,7 @@ def forward(
     F, H_full, y = np.empty((NAVIGATION, STATES)), np.empty((6, STATES)), np.empty(6)
     noise = np.empty(STATES)
     dx_full = np.zeros(STATES)
-    elapsed, gap_elapsed = 0.0, 0.0
+    elapsed, unseen_turn, unseen_velocity = 0.0, 0.0, 0.0
     epoch, at = 0, 0
     while at < measurements.time.size and measurements.time[at] < time[0]:
         at += 1
@@ -481,8 +482,8 @@ def forward(
                         sum_force[i] += c * dv[j]
                 step(position, velocity, q, dcm, dtheta, dv, dt)
                 elapsed += dt
-                if unit.gap[k]:
-                    gap_elapsed += dt
+                unseen_turn += unit.unseen[k, 0] * dt
+                unseen_velocity += unit.unseen[k, 1] * dt
             start = stop
             # A gap and a standstill are epochs of their own, or their noise would be spread over the samples beside them.
             changes = stop == end and (
@@ -503,8 +504,10 @@ def forward(
                     )
                     _transition(F, decay, unit.inverse_tau, elapsed, active, phi)
                     base = unit.still_noise if still else unit.noise
-                    for i in range(STATES):
-                        noise[i] = base[i] + unit.gap_noise[i] * gap_elapsed / elapsed
+                    noise[:] = base
+                    for i in range(3):
+                        noise[3 + i] += unseen_velocity / elapsed
+                        noise[6 + i] += unseen_turn / elapsed
                     _propagate(P, phi, decay, active, noise, elapsed)
                     for i in range(6):
                         theta[i] *= decay[i]
@@ -517,7 +520,7 @@ def forward(
                 sum_dcm[:] = 0.0
                 sum_rate[:] = 0.0
                 sum_cf[:] = 0.0
-                elapsed, gap_elapsed = 0.0, 0.0
+                elapsed, unseen_turn, unseen_velocity = 0.0, 0.0, 0.0
                 epoch += 1
                 store.epoch_time[epoch], store.epoch_measurement[epoch] = stop, -1
                 store.epoch_dx[epoch] = 0.0
@@ -682,20 +685,12 @@ def backward(count: int, active: Any, store: Any, out: Any) -> None:
             S_inv = np.ascontiguousarray(store.S_inv[at, :m, :m])
             K = np.ascontiguousarray(store.K[at, :, :m])
             y = store.y[at, :m]
-            # Cᵀλ − HᵀS⁻¹y = λ − Hᵀ(Kᵀλ + S⁻¹y);  CᵀΛC + HᵀS⁻¹H = Λ − HᵀGᵀ − GH + Hᵀ(KᵀG + S⁻¹)H with G = ΛK.
-            G = Lam @ K
-            Kt = np.ascontiguousarray(K.T)
+            # Not expanded: where P is far larger than R, ΛKH cancels against Λ to nothing but rounding.
             Ht = np.ascontiguousarray(H.T)
-            half = 0.5 * (Kt @ G + S_inv)
-            lam = lam - Ht @ (Kt @ lam + S_inv @ y)
-            A = G - Ht @ half
-            for i in range(n):
-                for j in range(i + 1):
-                    total = 0.0
-                    for r in range(m):
-                        total += A[i, r] * H[r, j] + A[j, r] * H[r, i]
-                    Lam[i, j] -= total
-                    Lam[j, i] = Lam[i, j]
+            C = np.eye(n) - K @ H
+            Ct = np.ascontiguousarray(C.T)
+            lam = Ct @ lam - Ht @ (S_inv @ y)
+            Lam = Ct @ (Lam @ C) + Ht @ (S_inv @ H)
         if e > 0:
             phi, decay = store.epoch_phi[e - 1], store.epoch_decay[e - 1]
             phi_t = np.ascontiguousarray(phi.T)

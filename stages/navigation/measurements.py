@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from pipeline.records import GNSS_QUALITIES, Gnss, Imu
+from pipeline.records import DATA_GAP, GNSS_QUALITIES, Gnss, Imu
 from stages.navigation import kalman
 from stages.navigation.settings import NavigationSettings
 from stages.navigation.standstill import Standstill
@@ -47,6 +47,12 @@ def withheld(time: Array, settings: NavigationSettings) -> NDArray[np.bool_]:
     if settings.free_inertial_after_s is not None:
         out |= time > settings.free_inertial_after_s
     return out
+
+
+def _in_gap(time: Array, wanted: Array) -> NDArray[np.bool_]:
+    """Which times lie inside a gap of the stamps: how the body moved there is not known, so a fix says nothing of it."""
+    after = np.clip(np.searchsorted(time, wanted), 1, time.size - 1)
+    return np.asarray(time[after] - time[after - 1] > DATA_GAP * np.median(np.diff(time)))
 
 
 def at_instants(time: Array, means: Array, wanted: Array) -> Array:
@@ -81,7 +87,7 @@ def gather(imu: Imu, gnss: Gnss, still: Standstill, latency: float, settings: Na
     velocity = gnss.velocity if with_velocity and gnss.velocity is not None else np.zeros((nfix, 3))
     sigma_velocity = gnss.sigma_velocity if with_velocity and gnss.sigma_velocity is not None else np.ones((nfix, 3))
     rate, force = (at_instants(imu.time, values, fix_time) for values in (imu.gyro, imu.accel))
-    kept = ~withheld(gnss.time, settings)
+    kept = ~withheld(gnss.time, settings) & ~_in_gap(imu.time, fix_time)
     parts = [
         (
             fix_time,

@@ -16,8 +16,16 @@ Array = NDArray[np.float64]
 BLOCK = 50_000  # samples at a time: what is in between for a whole flight would be the peak of memory
 
 
-def trajectory(solution: Solution) -> Trajectory:
-    """Position, velocity, attitude with sigmas, and the compensated inertial data."""
+Doubts = list[tuple[float, float, float, float]]
+
+
+def trajectory(solution: Solution, doubts: Doubts, least_heading_sigma: float = 0.0) -> Trajectory:
+    """Position, velocity, attitude with sigmas, and the compensated inertial data.
+
+    `doubts`: stretches (start, stop [s]; distance [m], velocity [m/s]) by which the sigmas of position and velocity grow, since
+    fixes that were rejected there turned out to be the ones that the path went on with; `least_heading_sigma` [rad]: below which
+    no heading is known.
+    """
     imu = solution.problem.imu
     n = imu.time.size
     dcm = solution.store.epoch_dcm[solution.epochs]
@@ -27,7 +35,13 @@ def trajectory(solution: Solution) -> Trajectory:
     for block in (slice(i, i + BLOCK) for i in range(0, n, BLOCK)):
         for whole, part in zip(arrays, _block(solution, sigma, theta, block), strict=True):
             whole[block] = part
-    return Trajectory(imu.time, *arrays)
+    out = Trajectory(imu.time, *arrays)
+    for start, stop, distance, velocity in doubts:
+        inside = slice(*np.searchsorted(imu.time, [start, stop]))
+        out.sigma_position[inside] = np.hypot(out.sigma_position[inside], distance)
+        out.sigma_velocity[inside] = np.hypot(out.sigma_velocity[inside], velocity)
+    np.maximum(out.sigma_attitude[:, 2], least_heading_sigma, out=out.sigma_attitude[:, 2])
+    return out
 
 
 def _block(s: Solution, sigmas_at: Array, theta: Array, block: slice) -> tuple[Array, ...]:

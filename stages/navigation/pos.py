@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu, ThermalCorrection, Trajectory
 from stages.navigation import output, quality, states
-from stages.navigation.alignment import Start, align, starting_at
+from stages.navigation.alignment import Start, align, heading_at_rest, starting_at
 from stages.navigation.clocks import refuse_jumps
 from stages.navigation.measurements import withheld
 from stages.navigation.settings import NavigationSettings
@@ -33,6 +33,7 @@ HEADING_SIGMA = np.deg2rad(20.0)  # of each of them
 TRIAL_S = 120.0  # of flight that a heading is tried on
 COURSE_SIGMA = np.deg2rad(40.0)  # how far a vehicle's heading may be from its course, where nothing else tells
 SETTLED = np.deg2rad(0.5)  # a smoothed correction of the first attitude below this needs no further pass
+BRIDGES = 3  # passes after which a gap is bridged anew
 LOOSE = np.deg2rad(1.0)  # a heading's sigma at the start above which a last pass is made with what is known by then
 SETTLED_LATENCY = 1e-4  # s: 2 % of the period of a 50 Hz vibration, which swings the antenna
 
@@ -68,7 +69,13 @@ def run(
     histories = quality.histories(solution)
     # What is left needs none of the matrices, which are most of a long flight's memory.
     solution = replace(solution, store=quality.without_matrices(solution.store))
-    trajectory = output.trajectory(solution)
+    quality.refuse_nonsense(solution)
+    problem = solution.problem
+    inside = (gnss.time >= problem.imu.time[0]) & (gnss.time <= problem.imu.time[-1])
+    compass = heading_at_rest(_unless(problem.gnss, ~inside), model.gyro, settings.course_speed_m_per_s)
+    known = float(problem.start.sigma_rpy[2])
+    floor = compass * known / np.hypot(compass, known)
+    trajectory = output.trajectory(solution, quality.doubted(solution), floor)
     figures_of_merit, figures = quality.assess(solution, trajectory, histories, passes)
     return NavigationResult(trajectory, figures_of_merit, figures)
 
@@ -85,7 +92,7 @@ def smooth(
 ) -> tuple[Solution, int]:
     """Filter and smoother as `run` has them, with all their matrices, and the number of passes."""
     imu = in_body_axes(imu, mounting, correction)
-    theta = declared(mounting, effects or {})
+    as_declared, theta = declared(mounting, {}), declared(mounting, effects or {})
     _overlap(imu, gnss)
     _bridgeable(imu, settings)
     late = float(theta[states.parameter("gnss_latency")][0])
@@ -95,7 +102,10 @@ def smooth(
     kept = replace(kept, time=kept.time - late)
     if kept.time.size < 2:
         raise InputError(
-            "gnss", "variable 'time'", f"leaves {kept.time.size} fixes that are not withheld", "withhold fewer"
+            "settings",
+            "navigation.withhold_s, withhold_every_s, free_inertial_after_s",
+            f"leave {kept.time.size} of the fixes from {gnss.time[0]:.1f} to {gnss.time[-1]:.1f} s",
+            "withhold fewer; times are seconds after the epoch",
         )
     still = find(imu, kept, model.gyro) if settings.standstill_updates else Standstill.none()
     lever = theta[states.parameter("antenna_lever_arm")]
@@ -104,7 +114,9 @@ def smooth(
         return _start(imu, kept, lever, model, still, settings, initial, offset)
 
     start = start_at(0.0)
-    problem = Problem(_from(imu, start.time), gnss, model, settings, still.after(start.time), start, theta, theta, late)
+    problem = Problem(
+        _from(imu, start.time), gnss, model, settings, still.after(start.time), start, as_declared, theta, late
+    )
     return _repeated(_surest_heading(problem, kept, start_at, initial is None))
 
 
@@ -211,9 +223,8 @@ def _surest_heading(problem: Problem, gnss: Gnss, start_at: Callable[[float], St
             best, highest = trial, value
     turned = np.rad2deg((best.start.rpy[2] - start.rpy[2] + np.pi) % (2 * np.pi) - np.pi)
     if abs(turned) > 1.0:
-        return replace(
-            best, start=replace(best.start, method=f"{start.method}; turned by {turned:.0f}° to fit the fixes")
-        )
+        said = f"{start.method}; turned by {turned:.0f}° to the heading that explains the fixes best"
+        return replace(best, start=replace(best.start, method=said))
     return best if aligned else problem
 
 
@@ -228,16 +239,30 @@ def _repeated(problem: Problem) -> tuple[Solution, int]:
             refuse_jumps(solution)
         attitude = np.linalg.norm(solution.shift(slice(0, 1))[0, states.ATTITUDE])
         late = float(solution.theta()[-1, states.parameter("gnss_latency")][0]) if estimates_latency else 0.0
-        shifted = _shifted(problem.start, solution)
-        loose = problem.start.sigma_rpy[2] > LOOSE and shifted.sigma_rpy[2] < 0.5 * problem.start.sigma_rpy[2]
+        shifted, before = _shifted(problem.start, solution), problem.start.sigma_rpy[2]
+        if _heading_is_unknown(problem.start, solution):
+            # Another pass about the smoothed heading would take its own noise for news. One about the smoothed tilt is needed all
+            # the same: a tilt that is corrected on the way makes the heading look observable.
+            roll, pitch, _ = shifted.rpy
+            shifted = replace(
+                shifted,
+                rpy=np.array([roll, pitch, problem.start.rpy[2]]),
+                sigma_rpy=np.array([*shifted.sigma_rpy[:2], before]),
+            )
+            loose, attitude = number == 1 and before > LOOSE, np.float64(0.0)
+        else:
+            loose = before > LOOSE and shifted.sigma_rpy[2] < 0.5 * before
         rough = attitude >= SETTLED or loose or abs(late) > SETTLED_LATENCY
-        if number == settings.passes or not (rough or (number == 1 and solution.gap.any())):
+        bridging = solution.gap.any() and number <= BRIDGES
+        if number == settings.passes or not (rough or bridging):
             return solution, number
         # The prior of position, velocity and attitude moves with the start and keeps its width, which is nothing beside the
         # flight's own information; that of the parameters stays where it was, since it does count.
         start = shifted if attitude >= SETTLED or loose else problem.start
-        imu = _bridged(solution) if solution.gap.any() else problem.imu
-        problem = replace(problem, start=start, imu=imu, latency=problem.latency + late)
+        problem = replace(problem, start=start, latency=problem.latency + late)
+        if solution.gap.any():
+            imu, variance = _bridged(solution)
+            problem = replace(problem, imu=imu, gap_variance=variance)
         if estimates_latency and _sigma(solution, "gnss_latency") < 0.2 * settings.gnss_latency_sigma_s:
             # Well known by now, so that a prior about the new value counts for nothing; one about the old would have the filter
             # begin 40 ms off, in a body that vibrates at 20 Hz.
@@ -283,14 +308,24 @@ def _shifted(start: Start, solution: Solution) -> Start:
     )
 
 
-def _bridged(solution: Solution) -> Imu:
-    """The inertial data with what a gap hid put in: the constant rate and force that join the smoothed path before and after.
+def _heading_is_unknown(start: Start, solution: Solution) -> bool:
+    """Whether the flight tells the start's heading no better than to half of what was known of it before."""
+    smoothed = output.sigmas(solution.smoothed.covariance[:1], solution.store.epoch_dcm[:1])[0, 8]
+    return bool(smoothed > 0.5 * start.sigma_rpy[2])
 
-    The noise that the gap adds stays; but the filter no longer linearises about a path that is degrees off behind it.
+
+def _bridged(solution: Solution) -> tuple[Imu, Array]:
+    """The inertial data with what a gap hid put in, the constant rate and force that join the smoothed path before and after, and
+    what is left unknown of each gap's rotation: variances per second (g,), from seven of the smoothed sigmas behind it.
+
+    With all the noise of the gap the filter would wander by degrees behind it and be linearised about that. Velocity keeps its
+    noise: how the force was spread over the gap, and so the way made, stays unknown.
     """
     imu, store = solution.problem.imu, solution.store
     gyro, accel = imu.gyro.copy(), imu.accel.copy()
-    for k in np.flatnonzero(solution.gap):
+    places = np.flatnonzero(solution.gap)
+    variance = np.empty(places.size)
+    for g, k in enumerate(places):
         before, after = int(store.epoch[k - 1]), int(store.epoch[k])
         length = imu.time[k] - imu.time[k - 1]
         # Epochs end at both sides of a gap; between them lie the updates of fixes inside it.
@@ -300,4 +335,7 @@ def _bridged(solution: Solution) -> Imu:
         to_body = quaternion_to_dcm(store.q[k]).T
         gyro[k] += to_body @ jump[states.ATTITUDE] / length
         accel[k] += to_body @ jump[states.VELOCITY] / length
-    return Imu(imu.time, gyro, accel)
+        # No less than it has just turned: what was bridged badly is not yet known so well.
+        left = float(np.diag(solution.smoothed.covariance[after])[states.ATTITUDE].max())
+        variance[g] = max(49.0 * left, float((jump[states.ATTITUDE] ** 2).sum())) / length
+    return replace(imu, gyro=gyro, accel=accel), variance

@@ -2,6 +2,8 @@
 
 Functions
 ---------
+doubted             where the path is doubtful although its sigmas do not know
+refuse_nonsense     no trajectory from fixes that contradict it
 histories           forward sigmas, forward/backward separation and parameters along the flight, while the matrices are there
 assess              all of it, in plain data
 """
@@ -15,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from pipeline.errors import StageError
 from pipeline.records import DATA_GAP, GNSS_QUALITIES, Gnss, Trajectory
 from stages.navigation import calibration, kalman, states
 from stages.navigation.measurements import withheld
-from stages.navigation.output import sigmas
+from stages.navigation.output import Doubts, sigmas
 from stages.navigation.solve import Solution
 from tsmftis.geodesy import local_metres
 from tsmftis.inertial import DEG_PER_H, MICRO_G
@@ -28,6 +31,7 @@ Array = NDArray[np.float64]
 
 NAUTICAL_MILE = 1852.0  # m
 AXES = ("north", "east", "down")
+MOST_REJECTED = 0.5  # of the fixes: beyond it there is no trajectory
 SEEN_BACKWARDS = (
     1e-3  # a direction of which the backward filter knows less than this, beside the forward one, has no separation
 )
@@ -104,6 +108,73 @@ def without_matrices(store: kalman.Store) -> kalman.Store:
     return store._replace(epoch_P=none, epoch_phi=none, epoch_decay=none, H=none, K=none, S_inv=none, y=none)
 
 
+def doubted(solution: Solution) -> Doubts:
+    """Stretches in which the path is doubtful, and by how much [m], [m/s]: from the first fix of a run of rejected ones to the
+    re-entry that ends it, and on to the next run where that follows within a minute."""
+    store, place, time = solution.store, solution.gathered.of_fix, solution.problem.gnss.time
+    known = np.flatnonzero(np.isfinite(store.nis[place]) & ~withheld(time, solution.problem.settings))
+    rejected = store.verdict[place[known], 0] == kalman.REJECTED
+    spans: Doubts = []
+    for at in np.flatnonzero(store.reentry[place[known]]):
+        # The run's other fixes keep their verdict; the one that ended it was believed.
+        first = int(at)
+        while first > 0 and rejected[first - 1]:
+            first -= 1
+        y = store.innovation[place[known[at]]]
+        size = (float(np.linalg.norm(y[:3])), float(np.linalg.norm(y[3:])))
+        begin, end = float(time[known[first]]), float(time[known[at]])
+        if spans and begin - spans[-1][1] < 60.0:
+            begin = spans[-1][1]
+        spans.append((begin, end, *size))
+    return spans
+
+
+def refuse_nonsense(solution: Solution) -> None:
+    """Raise StageError where most fixes contradict the inertial data: one of them, or what they are read with, is wrong."""
+    store, place = solution.store, solution.gathered.of_fix
+    known = np.isfinite(store.nis[place]) & ~withheld(solution.problem.gnss.time, solution.problem.settings)
+    share = float((store.verdict[place[known], 0] == kalman.REJECTED).mean()) if known.any() else 1.0
+    if share > MOST_REJECTED:
+        raise StageError(
+            f"{share:.0%} of the fixes contradict the inertial data: check `initial`, mounting.imu_to_body_deg, the lever arm, "
+            "the units and the clocks of both"
+        )
+
+
+def warnings(quality: dict[str, Any]) -> list[str]:
+    """What a reader must not overlook, in sentences."""
+    out = []
+    unit = quality.get("sigma_of_unit_weight")
+    if unit is not None and unit > 1.1 and not quality["innovation_nis_inside_band"]:
+        out.append(
+            f"The innovations are {unit:.2f} times as large as the declared sigmas of fixes and inertial unit allow. Either "
+            "those are too small, or the model lacks an effect: every sigma of this flight is too small by at least about that "
+            "factor. A run that estimates lever arm and latency (navigation.estimate) tells whether they are the cause."
+        )
+    for entry in quality["reentries"]:
+        out.append(
+            f"At {entry['time_s']:.1f} s positions had been rejected for so long that the filter took one "
+            f"{entry['innovation_m']:.3g} m away ({entry['seconds_of_flight']:+.3f} s of flight along the course): a datum or a "
+            "clock may have jumped, or the path before was wrong. Sigmas are widened there."
+        )
+    fixes = quality["fixes"]
+    share = fixes["rejected"] / max(fixes["rejected"] + fixes["used"], 1)
+    if share > 0.02:
+        out.append(f"{share:.1%} of the fixes were rejected.")
+    separation = quality["separation"]
+    if separation is not None and separation["chi2_over_expected"] > 2.0:
+        out.append(
+            "Forward and backward solution differ by more than their sigmas allow "
+            f"(χ² {separation['chi2_over_expected']:.1f} times expected)."
+        )
+    if quality["largest_correction_deg"] > 2.0:
+        out.append(
+            f"The smoother turned the filter's path by up to {quality['largest_correction_deg']:.1f}°, more than a linear model "
+            "bears: sigmas there are too small."
+        )
+    return out
+
+
 def assess(
     solution: Solution, trajectory: Trajectory, along: Histories, passes: int
 ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -138,6 +209,9 @@ def assess(
         "separation": _separation(along),
         "imu": _imu(solution),
         "gnss": _gnss(gnss),
+        "largest_correction_deg": float(
+            np.rad2deg(np.linalg.norm(solution.smoothed.correction[:, states.ATTITUDE], axis=1).max())
+        ),
         "standstill_s": problem.still.seconds,
         "standstill_rejected": _standstill_rejected(solution),
         **_gaps(solution),
@@ -149,10 +223,12 @@ def assess(
             problem.settings, problem.declared, along.theta[-1], along.covariance, trajectory
         ),
     }
-    if (~kept).any():
+    settings = problem.settings
+    if settings.withhold_s or settings.withhold_every_s is not None or settings.free_inertial_after_s is not None:
         quality["withheld"] = _misses(solution, trajectory, residual, seen & ~kept)
     if problem.settings.free_inertial_after_s is not None:
         quality["free_inertial"] = _free_inertial(solution, problem.settings.free_inertial_after_s)
+    quality["warnings"] = warnings(quality)
     return quality, _figures(solution, along, residual, used, seen, kept)
 
 
@@ -230,9 +306,10 @@ def _standstill_rejected(solution: Solution) -> int:
 
 
 def _imu(solution: Solution) -> dict[str, float]:
-    steps = np.diff(solution.problem.imu.time)
+    time = solution.problem.imu.time
+    steps = np.diff(time)
     return {
-        "rate_hz": float(1.0 / np.median(steps)),
+        "rate_hz": float(steps.size / (time[-1] - time[0])),
         "nominal_rate_hz": float(solution.problem.model.rate),
         "longest_step_s": float(steps.max()),
     }

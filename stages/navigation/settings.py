@@ -32,13 +32,13 @@ class NavigationSettings(BaseModel):
         "gyro_g_sensitivity may be added",
     )
     lever_arm_sigma_m: Positive = Field(
-        0.5, description="how far the declared antenna lever arm may be off an axis, where it is estimated"
+        0.5, le=100.0, description="how far the declared antenna lever arm may be off an axis, where it is estimated"
     )
     gnss_latency_sigma_s: Positive = Field(
-        0.1, description="how far the fixes' stamps may be off, where the latency is estimated"
+        0.1, le=5.0, description="how far the fixes' stamps may be off, where the latency is estimated"
     )
     g_sensitivity_sigma_deg_per_h_per_g: Positive = Field(
-        1.0, description="g-sensitivity of the gyros that is to be expected, where it is estimated"
+        1.0, le=1e4, description="g-sensitivity of the gyros that is to be expected, where it is estimated"
     )
     epoch_s: float = Field(0.2, ge=1e-3, le=1.0, description="longest step of the covariance")
     gate_probability: float = Field(1e-6, gt=0, lt=0.1, description="chance that a good fix is rejected")
@@ -62,13 +62,17 @@ class NavigationSettings(BaseModel):
         5.0, description="a longer gap in the inertial data is refused: nothing tells how the body moved in it"
     )
     withhold_s: tuple[Span, ...] = Field(
-        (), description="times [[start, stop], ...] whose fixes are not used; how far they are missed is reported"
+        (),
+        description="times [[start, stop], ...] [s after the epoch] whose fixes are not used, and whose misses are reported",
     )
     withhold_every_s: tuple[Positive, Positive] | None = Field(
-        None, description="[period, length]: the last `length` of every `period` seconds is withheld likewise"
+        None,
+        description="[period, length] [s] from the first fix on: the last `length` of every `period` is withheld likewise",
     )
     free_inertial_after_s: float | None = Field(
-        None, allow_inf_nan=False, description="no fix is used after this time; how far they are missed is reported"
+        None,
+        allow_inf_nan=False,
+        description="no fix is used after this time [s after the epoch]; their misses are reported",
     )
     free_inertial_height_sigma_m: Positive = Field(
         5.0,

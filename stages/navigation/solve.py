@@ -27,6 +27,7 @@ from tsmftis.rotation import dcm_to_quaternion, rpy_jacobian, rpy_to_dcm
 Array = NDArray[np.float64]
 
 HISTORY = 400  # epochs at which a pass keeps what the quality figures are made of
+LOST = 1.5  # usual steps: a longer one has lost a sample
 STANDSTILL_NOISE = 0.1  # of the gyros' white noise: what may turn a body that stands
 
 
@@ -44,6 +45,7 @@ class Problem:
     declared: Array
     theta: Array
     latency: float
+    gap_variance: Array | None = None  # of each gap's rotation, per second (g,): as known after a first pass
 
     @property
     def active(self) -> NDArray[np.int64]:
@@ -77,7 +79,7 @@ class Solution:
         return np.asarray(self.smoothed.correction[epochs, : states.NAVIGATION])
 
 
-def initial_covariance(start: Start, model: ImuModel, settings: NavigationSettings) -> Array:
+def initial_covariance(start: Start, model: ImuModel, settings: NavigationSettings, lever: Array) -> Array:
     """P at the start over all states (28, 28)."""
     variance = np.zeros(states.STATES)
     variance[states.POSITION], variance[states.VELOCITY] = start.sigma_position**2, start.sigma_velocity**2
@@ -96,8 +98,11 @@ def initial_covariance(start: Start, model: ImuModel, settings: NavigationSettin
     # Sigmas of roll, pitch, yaw into the NED rotation vector: φ = M·δrpy, the inverse of `rpy_jacobian`.
     to_ned = np.linalg.inv(rpy_jacobian(start.rpy[None])[0])
     P[states.ATTITUDE, states.ATTITUDE] = to_ned @ np.diag(start.sigma_rpy**2) @ to_ned.T
-    # The start was taken from a fix with the declared lever arm and stamp, so its error is theirs: δr = v·δt − C·δl + …
+    # The start was taken from a fix with the declared lever arm, stamp and attitude, so its error is theirs:
+    # δr = v·δt − C·δl + (C·l)×φ
     from_parameters = np.zeros((3, states.STATES))
+    arm = rpy_to_dcm(*start.rpy) @ lever
+    from_parameters[:, states.ATTITUDE] = [[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]]
     if "antenna_lever_arm" in settings.estimate:
         from_parameters[:, states.GROUPS["antenna_lever_arm"]] = -rpy_to_dcm(*start.rpy)
     if "gnss_latency" in settings.estimate:
@@ -124,20 +129,56 @@ def gaps(time: Array) -> NDArray[np.bool_]:
     return np.asarray(steps > DATA_GAP * np.median(steps[1:]))
 
 
+def unseen(imu: Imu, gap: NDArray[np.bool_]) -> Array:
+    """Variances per second (n, 2) of rotation and velocity for what lacks in an interval: none, a sample, or a gap.
+
+    In a gap the body moves as it does elsewhere: the data's own scatter, held over the gap. A sample that was lost was put in as
+    the mean of its neighbours (`filled`), whose difference says how wrong that may be.
+    """
+    steps = np.diff(imu.time, prepend=imu.time[0])
+    out = np.zeros((imu.time.size, 2))
+    lost = (steps > LOST * np.median(steps[1:])) & ~gap
+    for column, values in enumerate((imu.gyro, imu.accel)):
+        if gap.any():
+            out[gap, column] = values.var(axis=0).max() * steps[gap]
+        if lost.any():
+            jump = 0.5 * np.linalg.norm(values[lost] - values[np.flatnonzero(lost) - 1], axis=1)
+            out[lost, column] = jump**2 * steps[lost]
+    return out
+
+
+def filled(imu: Imu) -> Imu:
+    """Lost samples put in: a sample that follows an interval of nearly two is the mean over the last of them alone, and the
+    one that is lost is put in as the mean of its neighbours. Gaps are left as they are."""
+    steps = np.diff(imu.time, prepend=imu.time[0])
+    usual = float(np.median(steps[1:]))
+    lost = np.flatnonzero((steps > LOST * usual) & (steps <= DATA_GAP * usual))
+    lost = lost[lost > 0]
+    if not lost.size:
+        return imu
+    # Only where most stamps are even: a unit whose intervals scatter means what its stamps say.
+    if lost.size > 0.1 * steps.size:
+        return imu
+    missing = ((steps[lost] - usual) / steps[lost])[:, None]
+    whole = []
+    for values in (imu.gyro, imu.accel):
+        out = values.copy()
+        out[lost] = (1.0 - missing) * values[lost] + missing * 0.5 * (values[lost] + values[lost - 1])
+        whole.append(out)
+    return replace(imu, gyro=whole[0], accel=whole[1])
+
+
 def _unit(problem: Problem, gap: NDArray[np.bool_]) -> kalman.Unit:
     imu, model = problem.imu, problem.model
-    longest = float(np.diff(imu.time).max())
     noise = process_noise(model)
-    # Inside a gap the body moves as it does elsewhere: the data's own scatter, held over the gap, as white noise.
-    gap_noise = np.zeros(states.STATES)
-    if gap.any():
-        gap_noise[states.ATTITUDE] = imu.gyro.var(axis=0).max() * longest
-        gap_noise[states.VELOCITY] = imu.accel.var(axis=0).max() * longest
+    lacking = unseen(imu, gap)
+    if problem.gap_variance is not None:
+        lacking[gap, 0] = np.minimum(lacking[gap, 0], problem.gap_variance)
     still_noise = noise.copy()
     still_noise[states.ATTITUDE] *= STANDSTILL_NOISE**2
     tau = np.repeat([model.gyro.bias_correlation_time, model.accel.bias_correlation_time], 3)
     still = problem.still.holds(imu.time)
-    return kalman.Unit(imu.time, imu.gyro, imu.accel, gap, still, noise, gap_noise, still_noise, 1.0 / tau)
+    return kalman.Unit(imu.time, imu.gyro, imu.accel, gap, still, lacking, noise, still_noise, 1.0 / tau)
 
 
 def _filter(problem: Problem) -> tuple[Gathered, NDArray[np.bool_], int, kalman.Store]:
@@ -153,6 +194,7 @@ def _filter(problem: Problem) -> tuple[Gathered, NDArray[np.bool_], int, kalman.
     store = kalman.Store.empty(imu.time.size, size, measurements.time.size, active.size)
     gates = np.array([0.0] + [chi2.isf(settings.gate_probability, m) for m in range(1, 7)])
     theta = problem.theta.copy()
+    lever = theta[states.parameter("antenna_lever_arm")]
     theta[states.parameter("gnss_latency")] -= problem.latency
     count = kalman.forward(
         unit,
@@ -162,7 +204,7 @@ def _filter(problem: Problem) -> tuple[Gathered, NDArray[np.bool_], int, kalman.
         start.velocity.copy(),
         dcm_to_quaternion(rpy_to_dcm(*start.rpy)),
         theta,
-        initial_covariance(start, problem.model, settings)[np.ix_(active, active)],
+        initial_covariance(start, problem.model, settings, lever)[np.ix_(active, active)],
         settings.epoch_s,
         gates,
         settings.reentry_s,

@@ -251,7 +251,7 @@ def inside(seed: int) -> Inside:
     this = case(seed)
     s, _ = pos.smooth(this.imu, this.gnss, MODEL, Mounting(LEVER), NavigationSettings(), this.initial)
     *nees, error, left = consistency(this.craft, s, [30.0, 60.0, 90.0])
-    t = thinned(output.trajectory(s))
+    t = thinned(output.trajectory(s, []))
     r, v, rpy = errors(this.craft, t)
     scaled = np.concatenate([r / t.sigma_position, v / t.sigma_velocity, rpy / t.sigma_attitude], axis=1)
     return Inside(*nees, np.abs(error), np.abs(left), scaled, s.store.nis[s.store.used])
