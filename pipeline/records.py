@@ -532,6 +532,11 @@ class Bench:
         return xr.Dataset(variables, coords, attrs)
 
 
+def _wrapped(longitude: Array) -> Array:
+    """Longitudes [degrees] back within ±180°; those that are stay bit for bit."""
+    return np.where(np.abs(longitude) > 180.0, (longitude + 180.0) % 360.0 - 180.0, longitude)
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """The POS result at the IMU's origin: latitude, longitude [rad], height [m], velocity NED (n, 3) [m/s], rpy (n, 3) [rad].
@@ -558,7 +563,7 @@ class Trajectory:
         return xr.Dataset(
             {
                 "latitude": (time, deg(self.latitude), {"units": "degrees_north"}),
-                "longitude": (time, (deg(self.longitude) + 180.0) % 360.0 - 180.0, {"units": "degrees_east"}),
+                "longitude": (time, _wrapped(deg(self.longitude)), {"units": "degrees_east"}),
                 "height": (time, self.height, {"units": "m", "long_name": "height above the WGS-84 ellipsoid"}),
                 "velocity": (ned, self.velocity, {"units": "m s-1"}),
                 "roll": (time, deg(self.rpy[:, 0]), {"units": "degrees"}),
@@ -589,7 +594,7 @@ class Trajectory:
             return cls(
                 take_time(d, path),
                 np.deg2rad(take(d, path, "latitude", ("time",), "degrees_north")),
-                np.unwrap(np.deg2rad(take(d, path, "longitude", ("time",), "degrees_east"))),
+                np.deg2rad(take(d, path, "longitude", ("time",), "degrees_east")),
                 take(d, path, "height", ("time",), "m"),
                 take(d, path, "velocity", ("time", "ned"), "m s-1"),
                 np.stack([angle["roll"], angle["pitch"], (angle["yaw"] + np.pi) % (2 * np.pi) - np.pi], axis=1),

@@ -6,7 +6,7 @@ stamp − latency, by splines through the trajectory.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +101,7 @@ def poses_at(trajectory: Trajectory, time: Array) -> Trajectory:
     out["time"] = time
     if inside.any():
         part = trajectory.between(time[inside].min() - MARGIN_S, time[inside].max() + MARGIN_S)
+        part = replace(part, longitude=np.unwrap(part.longitude))  # across the date line
         at = time[inside]
         try:
             attitude = Attitude.fit(part.time, rpy_to_dcm(*part.rpy.T))

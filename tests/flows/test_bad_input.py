@@ -409,7 +409,7 @@ OPTIONS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "negative epoch": (("--set", "navigation.epoch_s=-1"), ("--set", "navigation.epoch_s")),
     "nan": (("--set", "navigation.epoch_s=.nan"), ("--set", "navigation.epoch_s")),
     "value that is no YAML": (("--set", "navigation.epoch_s=[1"), ("--set", "navigation.epoch_s", "YAML")),
-    "no settings file": (("--settings", "nowhere.yaml"), ("nowhere.yaml", "cannot be read")),
+    "no settings file": (("--settings", "nowhere.yaml"), ("nowhere.yaml", "does not exist")),
 }
 
 

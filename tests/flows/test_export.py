@@ -32,7 +32,7 @@ def test_csv_holds_the_trajectory_with_units_and_sigmas(demo_run: Path, tmp_path
     assert answer.code == 0 and "path.csv" in answer.out
     table, whole = rows(out), Trajectory.from_file(source)
     step = np.diff([float(r["time_s"]) for r in table])
-    np.testing.assert_allclose(step, 0.5, atol=0.006)
+    np.testing.assert_allclose(step[:-1], 0.5, atol=0.006)  # the last sample is always there
     at = int(np.argmin(np.abs(whole.time - float(table[7]["time_s"]))))
     for name, value in (
         ("latitude_deg", np.rad2deg(whole.latitude[at])),

@@ -267,7 +267,7 @@ def test_the_transition_is_the_derivative_of_the_mechanisation() -> None:
         kalman.forward(unit, nothing, active, position, velocity, q, theta, P, 0.2, np.ones(7), 20.0, store)
         return [position, velocity, quaternion_to_dcm(q)], store
 
-    theta = np.concatenate([1e-4 * np.ones(3), 1e-2 * np.ones(3), 1e-3 * np.ones(6), 1e-5 * np.ones(3), LEVER, [0.0]])
+    theta = np.concatenate([1e-4 * np.ones(3), 1e-2 * np.ones(3), 1e-3 * np.ones(6), 1e-7 * np.ones(3), LEVER, [0.0]])
     state: list[Any] = [np.array([0.7, 0.3, 900.0]), np.array([50.0, -20.0, 2.0]), rpy_to_dcm(0.2, -0.1, 1.1), theta]
     _, store = after(state)
     phi = store.epoch_phi[0]
