@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import shutil
@@ -430,6 +431,10 @@ SETTINGS_FILES: dict[str, tuple[bytes, tuple[str, ...]]] = {
     "a list": (b"- navigation\n", ("settings.yaml", "holds no keys")),
     "unknown key": (b"navigation: {colour: 1}\n", ("settings.yaml", "navigation.colour", "not known")),
     "a number for a stage": (b"navigation: 3\n", ("settings.yaml", "navigation")),
+    "a key twice": (
+        b"navigation: {passes: 2}\nnavigation: {passes: 3}\n",
+        ("settings.yaml", "line 2", "'navigation'", "twice"),
+    ),
 }
 
 
@@ -610,3 +615,24 @@ def test_an_earlier_result_survives_bad_input(copied: Path, demo_run: Path, tmp_
     truncated(FRAMES)(copied)
     assert tsmftis("run", copied, "--out", out).code == 2
     assert {p.relative_to(out): p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
+
+
+def test_a_folder_of_another_campaign_is_left_alone(demo_run: Path, copied: Path, tmp_path: Path, tsmftis: Any) -> None:
+    keys("name", to="another")(copied)
+    before = (demo_run / "run.json").read_bytes()
+    answer = tsmftis("run", copied, "--out", demo_run)
+    assert answer.code == 2
+    assert_one_line(answer.err, "--out", "holds results of the campaign 'tiny', not of 'another'")
+    assert (demo_run / "run.json").read_bytes() == before
+
+
+def test_two_runs_into_one_folder_do_not_meet(demo: Path, tmp_path: Path, tsmftis: Any) -> None:
+    """The lock is held by this process: a run in another one is told so, and leaves the folder as it is."""
+    out = tmp_path / "out"
+    out.mkdir()
+    with (out / ".lock").open("w") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        answer = tsmftis("run", demo, "--out", out)
+    assert answer.code == 2
+    assert_one_line(answer.err, "--out", "is in use by another run")
+    assert [p.name for p in out.iterdir()] == [".lock"]

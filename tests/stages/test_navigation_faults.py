@@ -11,13 +11,13 @@ import pytest
 import simulated
 from simulated import LEVER, MEMS, RLG, Grade, errors, rms
 
-from pipeline.errors import InputError
+from pipeline.errors import InputError, StageError
 from pipeline.records import Gnss, Imu
 from stages.navigation import NavigationResult, NavigationSettings, kalman, pos, run
 from stages.navigation.standstill import find
 from tsmftis.camera import Mounting
 from tsmftis.inertial import DEG_PER_H
-from tsmftis.rotation import log_so3, quaternion_to_dcm
+from tsmftis.rotation import log_so3, quaternion_to_dcm, rpy_jacobian
 from tsmftis.simulator import flight
 
 LEGS = [
@@ -393,3 +393,91 @@ def test_single_fixes_without_velocity_align_an_aircraft() -> None:
     scaled = np.concatenate([r / t.sigma_position, turn / t.sigma_attitude], axis=1)
     print("single", rms(r), np.rad2deg(np.abs(turn).max(axis=0)), np.abs(scaled).max(axis=0))
     assert np.abs(scaled).max() < 4.0 and np.rad2deg(np.abs(turn[:, 2]).max()) < 1.0
+
+
+def worst_z(craft: flight.Flight, result: NavigationResult, start: float, stop: float) -> float:
+    """Largest error over sigma of position, velocity and attitude between two times."""
+    t = result.trajectory._at(slice(*np.searchsorted(result.trajectory.time, [start, stop])))
+    r, v, turn = errors(craft, t)
+    rpy = np.einsum("nij,nj->ni", rpy_jacobian(t.rpy), turn)
+    scaled = np.concatenate([r / t.sigma_position, v / t.sigma_velocity, rpy / t.sigma_attitude], axis=1)
+    return float(np.abs(scaled).max())
+
+
+@pytest.mark.parametrize("grade", [RLG, MEMS], ids=lambda g: g.name)
+@pytest.mark.parametrize("length", [0.5, 2.0, 4.9])
+def test_sigmas_behind_a_gap_in_a_turn_are_honest(length: float, grade: Grade) -> None:
+    """For three seconds behind it no error is beyond 4 σ (9 states, correlated: measured at most 3.6)."""
+    craft, imu, gnss, initial = recorded("aircraft", grade)
+    result = solve(without(imu, 50.0, 50.0 + length), gnss, initial, grade)
+    assert worst_z(craft, result, 50.0 + length, 53.0 + length) < 4.0
+
+
+@pytest.mark.parametrize("share", [0.001, 0.05])
+def test_lost_samples_are_put_in(share: float) -> None:
+    """Single samples missing, stamps a step apart: the mean of the neighbours stands for them, within 4.5 σ everywhere."""
+    craft, imu, gnss, initial = recorded("aircraft")
+    kept = np.random.default_rng(1).random(imu.time.size) > share
+    result = solve(Imu(imu.time[kept], imu.gyro[kept], imu.accel[kept]), gnss, initial)
+    assert worst_z(craft, result, 2.0, 108.0) < 4.5
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_wild_first_fixes_start_no_flight(given: bool) -> None:
+    """The first fix 500 m off, or (self-aligned) the first three velocities reversed: rejected, and not believed for 20 s."""
+    craft, imu, gnss, initial = recorded("aircraft")
+    first = np.arange(gnss.time.size)
+    assert gnss.velocity is not None
+    wild = replace(
+        gnss,
+        latitude=gnss.latitude + (first < 1) * 500.0 / 6.36e6,
+        velocity=gnss.velocity * np.where(first < 3, -1.0, 1.0)[:, None],
+    )
+    result = solve(imu, wild, initial if given else None)
+    assert result.quality["reentries"] == [] and result.quality["fixes"]["rejected"] <= 1
+    position, turn = inner_rms(craft, result)
+    assert position < 0.02 and turn < 0.02
+
+
+def test_an_outage_leaves_no_sigma_of_zero() -> None:
+    """70 s without fixes, and a start a minute before the first: positive sigmas everywhere (P is 1e8 times R there)."""
+    _, imu, gnss, initial = recorded("aircraft", MEMS)
+    for kept in ((gnss.time < 30.0) | (gnss.time > 100.0), gnss.time > 60.0):
+        part = Gnss(*(getattr(gnss, n)[kept] for n in gnss.__dataclass_fields__))
+        t = solve(imu, part, initial, MEMS).trajectory
+        for sigma in (t.sigma_position, t.sigma_velocity, t.sigma_attitude):
+            assert sigma.min() > 0.0
+        assert t.sigma_position[:3000].max() > 0.1 or t.sigma_position.max() > 0.1
+
+
+def test_sigmas_widen_where_the_path_turned_out_wrong_and_it_is_said() -> None:
+    """20 m off for 30 s: taken after 20, left again after 20 more; in between sigmas are of metres, and warnings tell both."""
+    craft, imu, gnss, initial = recorded("aircraft")
+    off = (gnss.time > 60.0) & (gnss.time < 90.0)
+    result = solve(imu, replace(gnss, latitude=gnss.latitude + off * 20.0 / 6.36e6), initial)
+    assert len(result.quality["reentries"]) == 2
+    assert worst_z(craft, result, 62.0, 108.0) < 4.5
+    said = " ".join(result.quality["warnings"])
+    assert "rejected for so long" in said and "% of the fixes were rejected" in said
+
+
+def test_a_start_that_most_fixes_contradict_is_refused() -> None:
+    """A heading wrong by 170° that claims half a degree."""
+    _, imu, gnss, initial = recorded("aircraft")
+    time, rpy, sigma = initial
+    with pytest.raises(StageError, match="of the fixes contradict the inertial data: check `initial`"):
+        solve(imu, gnss, (time, rpy + np.array([0.0, 0.0, np.deg2rad(170.0)]), sigma))
+
+
+def test_a_parked_coarse_unit_does_not_invent_a_heading() -> None:
+    """110 s at rest with σ = 8°: neither filter nor smoother may claim to know it better than Earth rate and bias allow."""
+    craft, imu, gnss, _ = recorded("parked", MEMS)
+    grade = Grade("MEMS, 8°", MEMS.model, np.deg2rad([0.34, 0.34, 8.0]))
+    stop = int(np.searchsorted(imu.time, 110.0))
+    part = Imu(imu.time[:stop], imu.gyro[:stop], imu.accel[:stop])
+    for seed in range(3):
+        initial = simulated.attitude_known_to(craft, grade.sigma_rpy, np.random.default_rng(seed))
+        t = solve(part, gnss, initial, grade).trajectory
+        _, _, turn = errors(craft, t._at(np.array([6000])))
+        sigma = float(t.sigma_attitude[6000, 2])
+        assert np.rad2deg(sigma) > 7.0 and abs(turn[0, 2]) < 3.0 * sigma
