@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from flows.cli import exporting, importing, inspecting, running, settings, simulating
+from flows.cli import compensating, exporting, importing, inspecting, running, settings, simulating
 from pipeline.errors import TsmftisError
 from tsmftis import __version__
 
@@ -26,6 +26,7 @@ app.command("settings")(settings.settings)
 app.command("simulate")(simulating.simulate)
 app.add_typer(importing.app, name="import")
 app.add_typer(exporting.app, name="export")
+app.add_typer(compensating.app, name="thermal")
 
 
 def _version(wanted: bool) -> None:

@@ -17,8 +17,9 @@ from stages.thermal.model import ThermalModel
 from stages.thermal.settings import ThermalSettings
 from stages.thermal.training import fit_model
 from stages.thermal.verification import verification_table, verify_run
+from tsmftis.inertial import DEG_PER_H, MICRO_G
 
-__all__ = ["ThermalModel", "ThermalResult", "ThermalSettings", "run"]
+__all__ = ["DEG_PER_H", "MICRO_G", "ThermalModel", "ThermalResult", "ThermalSettings", "run", "verify"]
 
 
 @dataclass(frozen=True)
@@ -48,3 +49,8 @@ def run(train: Sequence[Chamber], verify: Sequence[Chamber], settings: ThermalSe
     model, table, notes = fit_model(train, settings)
     runs = [verify_run(model, chamber, settings.verification_block_s) for chamber in verify]
     return ThermalResult(model, verification_table(runs), {"training": table, "verify": runs}, notes)
+
+
+def verify(model: ThermalModel, runs: Sequence[Chamber], block_s: float) -> dict[str, dict[str, list[float]]]:
+    """Standard deviations of means over `block_s` [s] of what raw data and each method leave of runs: gyro [°/h], accel [µg]."""
+    return verification_table([verify_run(model, chamber, block_s) for chamber in runs])
