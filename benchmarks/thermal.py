@@ -137,7 +137,7 @@ def judge(seed: int, preset: str) -> dict[str, Any]:
                     if method == "bayesian_rbf":
                         network = channel.predictors[method]
                         assert isinstance(network, BayesianRbf)
-                        noise = network.noise_sigma * np.sqrt(model.block_s / BLOCK)
+                        noise = network.noise_of_mean(BLOCK / model.block_s)
                         total = np.hypot(means(sigma[:, None])[:, 0], noise)
                         left = means((bias[:, i] - predicted[:, i])[:, None])[:, 0]
                         covered.append(float((np.abs(left) < 1.96 * total).mean()))

@@ -16,6 +16,10 @@ deviation outside it, so the mean is bounded. What the units then cannot represe
 (1 − |φ_Gauss(x)|²)/(2α) + ρ²·|x − clamp(x)|²/(2α), is added to the predictive variance: without it a network is the
 surer the farther x lies from its centres [3]_.
 
+The noise of successive blocks may be correlated: with r_t = ρ·r_{t−1} + … it is whitened before anything is weighed, and ρ ≥ 0
+is of the largest evidence too (weights integrated out, so this is restricted maximum likelihood): N in the evidence then
+counts information and not samples.
+
 References
 ----------
 .. [1] D. J. C. MacKay, A practical Bayesian framework for backpropagation networks, Neural Computation 4 (1992) 448.
@@ -56,7 +60,7 @@ class BayesianRbf:
 
     centres (m, D), widths (D,), low and high (D,), where the linear units stop, in scaled features; `mixing` U (m, m);
     weights w (M,); `factor` F (M, M) with F·Fᵀ = H⁻¹; `ratio` ρ; `constant` c and `scale` in the target's unit: all
-    else is of (target − c)/scale. `count` is N.
+    else is of (target − c)/scale. `count` is N; `correlation` that of one block's noise with the next one's.
     """
 
     centres: Array
@@ -73,12 +77,24 @@ class BayesianRbf:
     constant: float
     scale: float
     count: int
+    correlation: float
     log_evidence: float
 
     @property
     def noise_sigma(self) -> float:
         """Standard deviation of a target's noise, in the target's unit: √(1/(2β))."""
         return self.scale * math.sqrt(0.5 / self.beta)
+
+    @property
+    def informative(self) -> float:
+        """How many independent targets the N correlated ones are worth: N·(1 − ρ)/(1 + ρ)."""
+        return self.count * (1.0 - self.correlation) / (1.0 + self.correlation)
+
+    def noise_of_mean(self, blocks: float) -> float:
+        """Standard deviation of the noise in a mean over as long as `blocks` targets: σ/√blocks, more where it is correlated."""
+        inflation = (1.0 + self.correlation) / (1.0 - self.correlation)
+        independent = blocks if blocks < 1.0 else max(blocks / inflation, 1.0)
+        return self.noise_sigma / math.sqrt(independent)
 
     def predict(self, features: Array) -> tuple[Array, Array]:
         """Mean and standard deviation (n,) of the function at scaled features (n, D), in the target's unit."""
@@ -101,7 +117,7 @@ class BayesianRbf:
             unknown += self.ratio**2 * ((x - held) ** 2).sum(axis=1)
             variance[part] = ((phi @ self.factor) ** 2).sum(axis=1) + unknown / (2.0 * self.alpha)
         # The constant is a mean of N targets and no surer than that.
-        variance += 0.5 / self.beta / self.count
+        variance += 0.5 / self.beta / self.informative
         return self.constant + self.scale * mean, self.scale * np.sqrt(variance)
 
 
@@ -147,65 +163,102 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def whitened(values: Tensor, correlation: Tensor | float, starts: Tensor) -> Tensor:
+    """Rows (N, ...) freed of first-order correlated noise: r_t → (r_t − ρ·r_{t−1})/√(1 − ρ²), but for the first of each run."""
+    rho = torch.as_tensor(correlation, dtype=values.dtype, device=values.device)
+    inner = (values[1:] - rho * values[:-1]) / torch.sqrt(1.0 - rho**2)
+    mask = starts[1:].reshape(-1, *[1] * (values.ndim - 1))
+    return torch.cat([values[:1], torch.where(mask, values[1:], inner)])
+
+
 def fit_network(
     features: Array,
     target: Array,
     *,
-    centres: int = 80,
+    starts: NDArray[np.bool_] | None = None,
+    centres: tuple[int, ...] = (20, 40, 80),
     start_widths: tuple[tuple[float, float], ...] = ((0.5, 5.0), (2.0, 2.0)),
     iterations: int = 100,
     device: str = "cpu",
 ) -> BayesianRbf:
-    """Train on scaled features (N, D) and targets (N,): widths by evidence from each start, the best one kept.
+    """Train on scaled features (N, D) and targets (N,): widths, noise and its colour by evidence from each start, the best kept.
 
-    A start is a pair of widths: of the first feature (T) and of the others.
+    A start is a pair of widths: of the first feature (T) and of the others. `starts` (N,) marks the first block of each run; one
+    run where it is left out. The number of Gaussian units is the smallest of `centres` whose evidence is within a nat of the
+    best.
     """
     constant, scale = float(target.mean()), float(target.std()) or 1.0
-    middle = features[spread_points(features, min(centres, len(features)))]
     dimensions = features.shape[1]
+    if starts is None:
+        starts = np.arange(len(target)) == 0
 
     def tensor(a: Array) -> Tensor:
         return torch.as_tensor(a, dtype=torch.float64, device=device)
 
     with one_thread():
-        x, y, c = tensor(features), tensor((target - constant) / scale), tensor(middle)
+        x, y, first_of_run = (
+            tensor(features),
+            tensor((target - constant) / scale),
+            torch.as_tensor(starts, device=device),
+        )
+        later = int((~starts).sum())
 
-        def design(q: Tensor) -> Tensor:
+        def design(q: Tensor, c: Tensor) -> Tensor:
             return torch.cat([_orthonormal(x, c, q[:dimensions]), q[dimensions].exp() * x], dim=1)
 
-        def objective(p: Array) -> tuple[float, Array]:
-            """−ln evidence − ln prior of (ln ℓ, ln ρ, ln α, ln β), and its gradient."""
+        def objective(p: Array, c: Tensor) -> tuple[float, Array]:
+            """−ln evidence − ln prior of (ln ℓ, ln ρ, artanh of the noise's correlation, ln α, ln β), and its gradient."""
             q = tensor(p).requires_grad_(True)
             prior = ((q[:dimensions] - LOG_WIDTH_MEAN) / LOG_WIDTH_SIGMA).square().sum()
             prior = prior + ((q[dimensions] - LOG_RATIO_MEAN) / LOG_RATIO_SIGMA).square()
-            loss = 0.5 * prior - log_evidence(design(q), y, q[-2], q[-1])
+            correlation = q[-3].tanh()
+            phi, goal = (whitened(v, correlation, first_of_run) for v in (design(q, c), y))
+            evidence = log_evidence(phi, goal, q[-2], q[-1]) - 0.5 * later * torch.log(1.0 - correlation**2)
+            loss = 0.5 * prior - evidence
             loss.backward()
             assert q.grad is not None
             return float(loss.detach()), q.grad.cpu().numpy()
 
         # Prior variance between 1e-4 and 1e4 of the target's, noise between 1e-7 and 10: H stays well conditioned.
-        bounds = [(math.log(0.05), math.log(100.0))] * dimensions + [(-6.0, 6.0)]
+        bounds = [(math.log(0.05), math.log(100.0))] * dimensions + [(-6.0, 6.0), (0.0, 2.0)]
         bounds += [(math.log(0.5e-4), math.log(0.5e4)), (math.log(0.05), math.log(0.5e7))]
-        fits = []
-        for first, others in start_widths:
-            widths = np.log([first] + [others] * (dimensions - 1))
-            start = np.r_[widths, LOG_RATIO_MEAN, math.log(2.0), math.log(50.0)]
-            fits.append(
-                minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations})
-            )
-        best = min(fits, key=lambda f: float(f.fun))
 
-        q = tensor(best.x)
-        phi = design(q)
-        final = reestimate(phi, y, float(q[-2].exp()), float(q[-1].exp()))
+        def search(start: Array, c: Tensor) -> tuple[float, Array]:
+            options = {"maxiter": iterations}
+            fit = minimize(objective, start, args=(c,), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+            return float(fit.fun), np.asarray(fit.x)
+
+        sizes = sorted({min(n, len(target)) for n in centres})
+        begin = [
+            np.r_[np.log([first] + [others] * (dimensions - 1)), LOG_RATIO_MEAN, 0.1, math.log(2.0), math.log(50.0)]
+            for first, others in start_widths
+        ]
+        fits: list[tuple[float, Array, Array]] = []
+        for n in sizes:
+            middle = features[spread_points(features, n)]
+            c = tensor(middle)
+            # More units go on from where fewer ended.
+            loss, best = min((search(p, c) for p in begin), key=lambda f: f[0])
+            fits.append((loss, best, middle))
+            begin = [best]
+            if len(middle) < n:
+                break
+        least = min(f[0] for f in fits)
+        _, best, middle = next(f for f in fits if f[0] <= least + 1.0)
+
+        c, q = tensor(middle), tensor(best)
+        correlation = math.tanh(best[-3])
+        phi, goal = (whitened(v, correlation, first_of_run) for v in (design(q, c), y))
+        final = reestimate(phi, goal, float(q[-2].exp()), float(q[-1].exp()))
         if not (final.alpha < 1e9 and final.beta < 1e9):
             # Without signal or without noise the fixed point runs away: the bounded values of the search stand.
-            final = posterior(phi, y, float(q[-2].exp()), float(q[-1].exp()))
-        evidence = log_evidence(phi, y, tensor(np.log(final.alpha)), tensor(np.log(final.beta)))
+            final = posterior(phi, goal, float(q[-2].exp()), float(q[-1].exp()))
+        evidence = float(log_evidence(phi, goal, tensor(np.log(final.alpha)), tensor(np.log(final.beta))))
+        evidence -= 0.5 * later * math.log(1.0 - correlation**2)
         mixing = torch.linalg.inv(_cholesky(c, q[:dimensions])).T
     return BayesianRbf(
         centres=middle,
-        widths=np.exp(best.x[:dimensions]),
+        widths=np.exp(best[:dimensions]),
         low=features.min(axis=0) - LINEAR_MARGIN,
         high=features.max(axis=0) + LINEAR_MARGIN,
         mixing=mixing.cpu().numpy(),
@@ -218,5 +271,6 @@ def fit_network(
         constant=constant,
         scale=scale,
         count=len(target),
-        log_evidence=float(evidence) - len(target) * math.log(scale),
+        correlation=correlation,
+        log_evidence=evidence - len(target) * math.log(scale),
     )

@@ -25,8 +25,8 @@ class ThermalSettings(BaseModel):
     causal: bool = False
     """Smooth with the past alone (as a real-time system must) instead of with past and future; Ṫ then comes a time
     constant late, which costs accuracy wherever the ramp changes."""
-    centres: Annotated[int, Field(ge=4)] = 80
-    """Most Gaussian units a channel may have."""
+    centres: tuple[Annotated[int, Field(ge=4)], ...] = Field(default=(20, 40, 80), min_length=1)
+    """Numbers of Gaussian units among which the evidence chooses: the smallest that is within a nat of the best."""
     start_widths: tuple[tuple[Positive, Positive], ...] = Field(default=((0.5, 5.0), (2.0, 2.0)), min_length=1)
     """From where the search for the most probable widths starts: pairs of the width in T and that in Ṫ and ∇T, in
     standard deviations of the features. The evidence often has two maxima: wavy in T and straight in the rest, or

@@ -28,9 +28,11 @@ COLOURED = 0.3
 
 @dataclass(frozen=True)
 class TrainingSet:
-    """Blocks of all runs: bias (N, 6), features of each channel (N, F), and which channels cannot be taught."""
+    """Blocks of all runs: bias (N, 6), features of each channel (N, F), which blocks begin a run (N,), and which channels cannot
+    be taught."""
 
     bias: Array
+    starts: NDArray[np.bool_]
     features: tuple[Array, ...]
     refused: tuple[str | None, ...]
 
@@ -63,11 +65,14 @@ def training_set(train: Sequence[Chamber], settings: ThermalSettings) -> Trainin
             f"gives {len(targets)} blocks of {settings.block_s:g} s where {FEWEST_BLOCKS} are needed",
             "give a longer run or a smaller thermal.block_s",
         )
-    return TrainingSet(targets, joined, tuple(refused))
+    starts = np.concatenate([np.arange(len(b)) == 0 for b in bias])
+    return TrainingSet(targets, starts, joined, tuple(refused))
 
 
-def fit_channel(features: Array, bias: Array, settings: ThermalSettings, teach: bool) -> ChannelModel:
-    """One channel from features (N, F) and bias (N,)."""
+def fit_channel(
+    features: Array, bias: Array, starts: NDArray[np.bool_], settings: ThermalSettings, teach: bool
+) -> ChannelModel:
+    """One channel from features (N, F), bias (N,) and which blocks begin a run (N,)."""
     span = np.ptp(features, axis=0)
     least = np.array(LEAST_SPAN[: features.shape[1]])
     used = span >= least
@@ -85,6 +90,7 @@ def fit_channel(features: Array, bias: Array, settings: ThermalSettings, teach: 
             "bayesian_rbf": fit_network(
                 x,
                 bias,
+                starts=starts,
                 centres=settings.centres,
                 start_widths=settings.start_widths,
                 iterations=settings.iterations,
@@ -100,7 +106,7 @@ def fit_model(
     """The model, a table of what each network learnt, and notes on what could not be learnt."""
     data = training_set(train, settings)
     channels = tuple(
-        fit_channel(data.features[i], data.bias[:, i], settings, data.refused[i] is None) for i in range(6)
+        fit_channel(data.features[i], data.bias[:, i], data.starts, settings, data.refused[i] is None) for i in range(6)
     )
     model = ThermalModel(channels, settings.smoothing_s, settings.causal, settings.block_s, settings.minimum_span_k)
     table: list[dict[str, object]] = []
@@ -120,12 +126,11 @@ def fit_model(
             continue
         network = channels[i].predictors["bayesian_rbf"]
         assert isinstance(network, BayesianRbf)
-        residual = data.bias[:, i] - channels[i].predict(data.features[i])[0]
-        correlation = float((residual[1:] * residual[:-1]).mean() / max((residual**2).mean(), 1e-300))
-        if correlation > COLOURED:
+        if network.correlation > COLOURED:
             notes.append(
-                f"Channel {name}: what the network leaves of one block correlates with the next by {correlation:.2f}: "
-                "the noise is coloured or the bias has a memory, and the stated sigmas are too small."
+                f"Channel {name}: the noise of one block correlates with the next by {network.correlation:.2f}, so its "
+                f"{network.count} blocks count as {network.informative:.0f}: the noise is coloured, or the bias has a memory "
+                "that this model lacks."
             )
         table.append(
             {
@@ -139,7 +144,7 @@ def fit_model(
                 "widths": network.widths.tolist(),
                 "linear_ratio": network.ratio,
                 "noise_sigma": network.noise_sigma,
-                "residual_correlation": correlation,
+                "noise_correlation": network.correlation,
             }
         )
     return model, table, notes

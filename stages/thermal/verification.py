@@ -40,8 +40,9 @@ def verify_run(model: ThermalModel, chamber: Chamber, seconds: float) -> dict[st
         if method == "bayesian_rbf":
             function = means(np.column_stack([s for _, s in predicted]))
             networks = [c.predictors.get(method) for c in model.channels]
-            noise = np.array([n.noise_sigma if isinstance(n, BayesianRbf) else 0.0 for n in networks])
-            sigma = np.hypot(function, noise * np.sqrt(model.block_s / seconds))
+            blocks = seconds / model.block_s
+            noise = np.array([n.noise_of_mean(blocks) if isinstance(n, BayesianRbf) else 0.0 for n in networks])
+            sigma = np.hypot(function, noise)
     temperature = np.column_stack([chamber.temperatures.gyro.mean(axis=2), chamber.temperatures.accel])
     on_time = np.column_stack([np.interp(chamber.time, chamber.temperatures.time, t) for t in temperature.T])
     return {

@@ -164,7 +164,7 @@ def test_network_with_a_centre_at_every_datum_is_a_gaussian_process() -> None:
     rng = np.random.default_rng(5)
     x = rng.uniform(-1.5, 1.5, (60, 2))
     y = 3.0 + np.sin(2 * x[:, 0]) + 0.5 * x[:, 1] + 0.05 * rng.standard_normal(60)
-    net = fit_network(x, y, centres=60, start_widths=((1.0, 1.0),))
+    net = fit_network(x, y, centres=(60,), start_widths=((1.0, 1.0),))
     amplitude = 0.5 / net.alpha
     kernel = ConstantKernel(amplitude) * RBF(net.widths) + ConstantKernel(amplitude * net.ratio**2) * DotProduct(0.0)
     oracle = GaussianProcessRegressor(kernel, alpha=0.5 / net.beta, optimizer=None)
@@ -197,7 +197,7 @@ def test_an_ideal_imu_has_no_bias() -> None:
 
 def test_without_attitude_the_mean_is_the_reference(train: Chamber) -> None:
     assert np.abs(bias_samples(replace(train, attitude=None)).mean(axis=0)).max() < 1e-12
-    notes = run([replace(train, attitude=None)], [], ThermalSettings(centres=10, start_widths=((2.0, 2.0),))).notes
+    notes = run([replace(train, attitude=None)], [], ThermalSettings(centres=(10,), start_widths=((2.0, 2.0),))).notes
     assert any("no attitude" in note for note in notes)
 
 
@@ -244,7 +244,7 @@ def test_one_thermometer_means_no_gradients(train: Chamber) -> None:
     assert [f.shape[1] for f in channel_features(one, train.time[:5], 30.0)] == [2] * 6
     # The reader repeats a single thermometer three times: its gradients then do not vary and are not used.
     three = replace(one, gyro=np.repeat(one.gyro, 3, axis=2))
-    fast = ThermalSettings(centres=10, start_widths=((2.0, 2.0),))
+    fast = ThermalSettings(centres=(10,), start_widths=((2.0, 2.0),))
     models = [run([replace(train, temperatures=t)], [], fast).model for t in (one, three)]
     ours, theirs = (model.correction(t).gyro for model, t in zip(models, (one, three), strict=True))
     np.testing.assert_allclose(ours, theirs, atol=1e-6 * np.ptp(ours))
@@ -297,7 +297,7 @@ def test_model_file_gives_the_same_correction(result: ThermalResult, train: Cham
 
 
 def test_same_input_same_bytes(train: Chamber) -> None:
-    fast = ThermalSettings(centres=20, start_widths=((2.0, 2.0),))
+    fast = ThermalSettings(centres=(20,), start_widths=((2.0, 2.0),))
     first, second = (run([train], [], fast).model.correction(train.temperatures) for _ in range(2))
     assert first.gyro.tobytes() == second.gyro.tobytes()
     assert first.sigma_accel.tobytes() == second.sigma_accel.tobytes()
@@ -346,7 +346,7 @@ def test_stuck_thermometer_leaves_the_channel_uncompensated(train: Chamber) -> N
     gyro, accel = t.gyro.copy(), t.accel.copy()
     gyro[:, 1, 2], accel[:, 0] = 21.0, 25.0
     stuck = replace(train, temperatures=replace(t, gyro=gyro, accel=accel))
-    result = run([stuck], [stuck], ThermalSettings(centres=10, start_widths=((2.0, 2.0),)))
+    result = run([stuck], [stuck], ThermalSettings(centres=(10,), start_widths=((2.0, 2.0),)))
     left_out = [n.split(" is left")[0] for n in result.notes if "uncompensated" in n]
     assert left_out == ["Channel gyro_y", "Channel accel_x"]
     assert any("shell thermometer" in n for n in result.notes)
