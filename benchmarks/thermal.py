@@ -4,34 +4,26 @@
 
 An instrument is drawn from a seed: thermometers' nodes, laws of the biases, scale factors. It is trained on the first profile and
 judged on the second, and on a third that goes 20 °C beyond the first. The floor of a channel is the standard deviation of 100 s
-means of its noise alone. The Gaussian process is scikit-learn's, with a width for each feature, on the same blocks and features.
+means of its noise alone. Gaussian process and BayesianRidge are scikit-learn's on the same blocks and features.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-import warnings
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from pipeline.records import Chamber, StaticAttitude, Temperatures
 from stages import thermal
 from stages.simulation import SimulationSettings, sensors
 from stages.simulation.records import ChamberRun
 from stages.simulation.settings import AirProfile
-from stages.thermal.features import STEPS_PER_TIME_CONSTANT
-from stages.thermal.network import BayesianRbf
-from stages.thermal.targets import bias_samples, block_means, thinned
-from stages.thermal.training import training_set
+from stages.thermal.targets import bias_samples, block_means
 from tsmftis.simulator import effects
 from tsmftis.simulator.streams import stream
 
@@ -39,7 +31,7 @@ Array = NDArray[np.float64]
 
 WORKERS = 2
 BLOCK = 100.0
-METHODS = ("raw", "polynomial", "rbf", "bayesian_rbf", "gaussian_process")
+BASELINES = ("polynomial", "multi_polynomial", "rbf", "gaussian_process", "bayesian_ridge")
 # 20 °C beyond the training profile's −30 and 50 °C, both ways.
 BEYOND = AirProfile.model_validate(
     {
@@ -81,91 +73,64 @@ def instrument(seed: int, settings: SimulationSettings) -> dict[str, tuple[Chamb
     return out
 
 
-def gaussian_process(features: Array, bias: Array) -> Any:
-    """scikit-learn's, one width a feature, signal and noise by marginal likelihood, two restarts."""
-    scale = float(bias.std())
-    kernel = ConstantKernel(1.0, (1e-3, 1e4)) * RBF(np.ones(features.shape[1]), (0.05, 100.0)) + WhiteKernel(
-        0.1, (1e-7, 10.0)
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        gp = GaussianProcessRegressor(kernel, n_restarts_optimizer=2, random_state=0)
-        return gp.fit(features, (bias - bias.mean()) / scale), float(bias.mean()), scale
-
-
 def judge(seed: int, preset: str) -> dict[str, Any]:
-    """Residual over floor by method and channel on `verify`, coverage of 95 % intervals on both, and seconds of fitting."""
+    """By method and channel on `verify` and `beyond`: residual [°/h, µg] and its floor; coverage of 95 % intervals; seconds."""
     settings = SimulationSettings.preset(preset)
     runs = instrument(seed, settings)
-    chosen = thermal.ThermalSettings()
+    seconds = {}
+    for name, baselines in (("network", ()), ("with the Gaussian process", ("gaussian_process",)), ("all", BASELINES)):
+        chosen = thermal.ThermalSettings(baselines=baselines)
+        started = time.perf_counter()
+        model = thermal.run([runs["train"][0]], [], chosen).model
+        seconds[name] = time.perf_counter() - started
+    flight = np.linspace(0.0, 12000.0, 12001)
+    warm = 20.0 + 10.0 * np.sin(flight / 2000.0)
     started = time.perf_counter()
-    model = thermal.run([runs["train"][0]], [], chosen).model
-    seconds = time.perf_counter() - started
-    data = training_set([runs["train"][0]], chosen)
-    started = time.perf_counter()
-    processes = []
-    for channel, features, bias in zip(model.channels, data.features, data.bias.T, strict=True):
-        scaled = ((features - channel.mean) / channel.scale)[:, channel.used]
-        processes.append(gaussian_process(scaled, bias))
-    gp_seconds = time.perf_counter() - started
-    out: dict[str, Any] = {"seconds": seconds, "gp_seconds": gp_seconds}
+    model.correction(Temperatures(flight, np.tile(warm[:, None, None], (1, 3, 3)), np.tile(warm[:, None], (1, 3))))
+    seconds["apply"] = time.perf_counter() - started
+    out: dict[str, Any] = {"seconds": seconds}
     for name in ("verify", "beyond"):
         run, true = runs[name]
-        thin = thinned(run, BLOCK, chosen.smoothing_s / STEPS_PER_TIME_CONSTANT)
-        # The run as it is, without noise: what each method leaves of it is its own error.
-        clean = replace(run, gyro=run.gyro - bias_samples(run)[:, :3] + true[:, :3],
-                        accel=run.accel - bias_samples(run)[:, 3:] + true[:, 3:])  # fmt: skip
-        bias, exact = (
-            bias_samples(thin),
-            bias_samples(thinned(clean, BLOCK, chosen.smoothing_s / STEPS_PER_TIME_CONSTANT)),
-        )
-        features = model.features(thin.temperatures, thin.time)
-
-        def means(values: Array, time_s: Array = thin.time) -> Array:
-            return block_means(time_s, values, BLOCK)
-
-        floor = means(bias - exact).std(axis=0)
-        ratios, covered = {}, []
-        for method in METHODS:
-            predicted = np.zeros_like(bias)
-            for i, (channel, f) in enumerate(zip(model.channels, features, strict=True)):
-                if method == "gaussian_process":
-                    gp, centre, scale = processes[i]
-                    predicted[:, i] = centre + scale * gp.predict(((f - channel.mean) / channel.scale)[:, channel.used])
-                elif method != "raw":
-                    predicted[:, i], sigma = channel.predict(f, method)
-                    if method == "bayesian_rbf":
-                        network = channel.predictors[method]
-                        assert isinstance(network, BayesianRbf)
-                        noise = network.noise_of_mean(BLOCK / model.block_s)
-                        total = np.hypot(means(sigma[:, None])[:, 0], noise)
-                        left = means((bias[:, i] - predicted[:, i])[:, None])[:, 0]
-                        covered.append(float((np.abs(left) < 1.96 * total).mean()))
-            ratios[method] = means(bias - predicted).std(axis=0) / floor
-        out[name] = {"ratios": ratios, "covered": covered, "floor": floor}
+        shown = thermal.verify_run(model, run, BLOCK)
+        scale = np.repeat([1.0 / thermal.DEG_PER_H, 1.0 / thermal.MICRO_G], 3)
+        left = {"raw": shown["raw"], **shown["left"]}
+        covered = (np.abs(left["bayesian_rbf"]) < 1.96 * shown["sigma"]).mean(axis=0)
+        floor = block_means(run.time, bias_samples(run) - true, BLOCK).std(axis=0)
+        out[name] = {
+            "left": {method: values.std(axis=0) * scale for method, values in left.items()},
+            "floor": floor * scale,
+            "covered": covered,
+        }
     return out
 
 
 def instruments(count: int, preset: str) -> None:
     with ProcessPoolExecutor(WORKERS) as pool:
         found = list(pool.map(partial(judge, preset=preset), range(count)))
-    print(f"{count} instruments of the preset {preset}: residual over noise floor on the verification profile")
-    print(f"  {'':<18}{'gyro: median':>14}{'95th':>8}{'accel: median':>16}{'95th':>8}")
-    by = {m: np.array([f["verify"]["ratios"][m] for f in found]) for m in METHODS}
-    for method, ratio in by.items():
-        g, a = ratio[:, :3].ravel(), ratio[:, 3:].ravel()
+    methods = list(found[0]["verify"]["left"])
+    floor = np.array([f["verify"]["floor"] for f in found])
+    by = {m: np.array([f["verify"]["left"][m] for f in found]) for m in methods}
+    print(f"{count} instruments of the preset {preset}; what is left of 100 s means on the verification profile")
+    print(
+        f"  {'mean ± spread':<18}" + "".join(f"{n:>17}" for n in ("gyro x [°/h]", "y", "z", "accel x [µg]", "y", "z"))
+    )
+    for name, values in (("noise floor", floor), *by.items()):
         print(
-            f"  {method:<18}{np.median(g):14.3f}{np.percentile(g, 95):8.3f}{np.median(a):16.3f}{np.percentile(a, 95):8.3f}"
+            f"  {name:<18}"
+            + "".join(f"{m:10.4g} ±{s:5.2g}" for m, s in zip(values.mean(0), values.std(0), strict=True))
         )
+    print(f"  {'over the floor':<18}{'gyro: median':>14}{'95th':>8}{'accel: median':>16}{'95th':>8}")
+    for method in methods:
+        g, a = (by[method][:, part] / floor[:, part] for part in (slice(0, 3), slice(3, 6)))
+        row = (np.median(g), np.percentile(g, 95), np.median(a), np.percentile(a, 95))
+        print(f"  {method:<18}{row[0]:14.3f}{row[1]:8.3f}{row[2]:16.3f}{row[3]:8.3f}")
     for name, part in (("gyros", slice(0, 3)), ("accelerometers", slice(3, 6))):
         new, old, gp = (by[m][:, part].ravel() for m in ("bayesian_rbf", "rbf", "gaussian_process"))
-        reduction = 1.0 - new / old
+        reduction, over = 1.0 - new / old, new / gp - 1.0
         low, high = np.percentile(reduction, [25, 75])
-        middle = np.median(reduction)
         print(
-            f"  {name}: under the traditional RBF by {middle:+.1%} in the median (quartiles {low:+.1%}, {high:+.1%}),"
+            f"  {name}: under the traditional RBF by {np.median(reduction):+.1%} (quartiles {low:+.1%}, {high:+.1%}),"
         )
-        over = new / gp - 1.0
         print(
             f"    over the Gaussian process by {np.median(over):+.1%} (95th percentile {np.percentile(over, 95):+.1%})"
         )
@@ -174,10 +139,8 @@ def instruments(count: int, preset: str) -> None:
         print(
             f"  95 % intervals hold on {name}: gyros {covered[:, :3].mean():.3f}, accelerometers {covered[:, 3:].mean():.3f}"
         )
-    print(
-        f"  fitting six channels: {np.median([f['seconds'] for f in found]):.1f} s, six Gaussian processes "
-        f"{np.median([f['gp_seconds'] for f in found]):.1f} s (two instruments at a time)"
-    )
+    for name in found[0]["seconds"]:
+        print(f"  seconds, {name}: {np.median([f['seconds'][name] for f in found]):.2f} (two instruments at a time)")
 
 
 def main() -> None:

@@ -74,9 +74,9 @@ def verify(model: Model, chambers: Runs) -> None:
     known = thermal.ThermalModel.from_file(model)
     table = thermal.verify(known, _read(chambers), thermal.ThermalSettings().verification_block_s)
     shown = Table(show_edge=False, header_style="bold", pad_edge=False)
-    shown.add_column("method")
+    shown.add_column("method", no_wrap=True)
     for name in ("gyro x [°/h]", "y", "z", "accel x [µg]", "y", "z"):
-        shown.add_column(name, justify="right")
+        shown.add_column(name, justify="right", no_wrap=True)
     for method in table["gyro_std_deg_per_h"]:
         values = [*table["gyro_std_deg_per_h"][method], *table["accel_std_ug"][method]]
         shown.add_row(method.replace("_", " "), *(f"{v:.4g}" for v in values))

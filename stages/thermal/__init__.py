@@ -19,7 +19,7 @@ from stages.thermal.training import fit_model
 from stages.thermal.verification import verification_table, verify_run
 from tsmftis.inertial import DEG_PER_H, MICRO_G
 
-__all__ = ["DEG_PER_H", "MICRO_G", "ThermalModel", "ThermalResult", "ThermalSettings", "run", "verify"]
+__all__ = ["DEG_PER_H", "MICRO_G", "ThermalModel", "ThermalResult", "ThermalSettings", "run", "verify", "verify_run"]
 
 
 @dataclass(frozen=True)

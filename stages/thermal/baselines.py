@@ -1,6 +1,6 @@
-"""What the Bayesian network is held against: a polynomial in T and the traditional RBF, with the same fit and predict.
+"""What the Bayesian network is held against: polynomials and the traditional RBF, with the same fit and predict.
 
-Both are linear least squares on a design of their own, and both get what cross-validation can give them: the polynomial
+All are linear least squares on a design of their own, and get what cross-validation can give them: a polynomial
 its degree, the RBF its number of nodes and its width. Folds are contiguous stretches of the run, because neighbouring
 blocks of a slow run are nearly copies of each other and would flatter any number of nodes.
 
@@ -12,6 +12,7 @@ References
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -40,6 +41,19 @@ class Polynomial:
 
 
 @dataclass(frozen=True)
+class MultiPolynomial:
+    """δ = Σ_k a_k·Π_d x_d^(e_kd): all products of the features up to a degree; exponents e (K, D), coefficients a (K,)."""
+
+    exponents: Array
+    coefficients: Array
+    residual_sigma: float
+
+    def predict(self, features: Array) -> tuple[Array, Array]:
+        """Mean and standard deviation (n,); the latter is that of the training residuals, the same everywhere."""
+        return products(features, self.exponents) @ self.coefficients, np.full(len(features), self.residual_sigma)
+
+
+@dataclass(frozen=True)
 class TraditionalRbf:
     """δ = c + Σ_m v_m·exp(−|x − c_m|²/2s²): centres (M, D), one width s, unregularised weights (1 + M,)."""
 
@@ -57,6 +71,17 @@ class TraditionalRbf:
 def polynomial_design(features: Array, degree: int) -> Array:
     """Powers 0 … degree of the first feature, (n, degree + 1)."""
     return np.vander(features[:, 0], degree + 1, increasing=True)
+
+
+def products(features: Array, exponents: Array) -> Array:
+    """Products of powers of the features (n, D), one for each row of exponents (K, D): (n, K)."""
+    return np.asarray(np.prod(features[:, None, :] ** exponents[None], axis=2))
+
+
+def exponents_up_to(degree: int, dimensions: int) -> Array:
+    """All exponents (K, D) whose sum is at most `degree`."""
+    every = itertools.product(range(degree + 1), repeat=dimensions)
+    return np.array([e for e in every if sum(e) <= degree], float)
 
 
 def rbf_design(features: Array, centres: Array, width: float) -> Array:
@@ -91,6 +116,15 @@ def fit_polynomial(features: Array, target: Array, degrees: Sequence[int]) -> Po
     design = polynomial_design(features, best)
     coefficients = least_squares(design, target)
     return Polynomial(coefficients, _sigma(target - design @ coefficients, len(coefficients)))
+
+
+def fit_multi_polynomial(features: Array, target: Array, degrees: Sequence[int]) -> MultiPolynomial:
+    """The polynomial in all features whose degree predicts held-out stretches best."""
+    designs = {d: exponents_up_to(d, features.shape[1]) for d in degrees}
+    best = _best(degrees, lambda d: cross_validated(products(features, designs[d]), target))
+    design = products(features, designs[best])
+    coefficients = least_squares(design, target)
+    return MultiPolynomial(designs[best], coefficients, _sigma(target - design @ coefficients, len(coefficients)))
 
 
 def fit_traditional_rbf(

@@ -2,7 +2,7 @@
 
 Classes
 -------
-ChannelModel    one channel: how its features are scaled, and its three predictors
+ChannelModel    one channel: how its features are scaled, and its predictors
 ThermalModel    the six channels and how their features are made
 """
 
@@ -19,25 +19,28 @@ from numpy.typing import NDArray
 from pipeline.datasets import open_dataset
 from pipeline.errors import InputError
 from pipeline.records import Temperatures, ThermalCorrection
-from stages.thermal.baselines import Polynomial, TraditionalRbf
+from stages.thermal.baselines import MultiPolynomial, Polynomial, TraditionalRbf
 from stages.thermal.features import NAMES, STEPS_PER_TIME_CONSTANT, channel_features, stuck_thermometers
 from stages.thermal.network import BayesianRbf
+from stages.thermal.oracles import GaussianProcess, RidgeRbf
 from stages.thermal.targets import CHANNELS
 
 Array = NDArray[np.float64]
 
 SCHEMA = "tsmftis-thermal-model/1"
-METHODS = ("polynomial", "rbf", "bayesian_rbf")
 PREDICTORS: dict[str, type[Any]] = {
     "polynomial": Polynomial,
+    "multi_polynomial": MultiPolynomial,
     "rbf": TraditionalRbf,
+    "gaussian_process": GaussianProcess,
+    "bayesian_ridge": RidgeRbf,
     "bayesian_rbf": BayesianRbf,
 }
 UNITS = ("rad s-1", "m s-2")
 
 
 class Predictor(Protocol):
-    """What the three methods have in common."""
+    """What all methods have in common."""
 
     def predict(self, features: Array) -> tuple[Array, Array]:
         """Mean and standard deviation (n,) at scaled features (n, D)."""
@@ -85,6 +88,12 @@ class ThermalModel:
     causal: bool
     block_s: float
     minimum_span_k: float
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The methods that were fitted, in the order in which tables have them."""
+        fitted = {name for channel in self.channels for name in channel.predictors} | {"bayesian_rbf"}
+        return tuple(name for name in PREDICTORS if name in fitted)
 
     def features(self, temperatures: Temperatures, at: Array) -> tuple[Array, ...]:
         """Features of the six channels at times (n,); a channel trained without gradients gets none."""

@@ -37,6 +37,15 @@ class ThermalSettings(BaseModel):
     """The verification figures are standard deviations of means over this time."""
     minimum_span_k: float = Field(default=2.0, ge=0.5)
     """A chamber run in which a channel's temperature moves less teaches it nothing."""
+    baselines: tuple[Literal["polynomial", "multi_polynomial", "rbf", "gaussian_process", "bayesian_ridge"], ...] = (
+        "polynomial",
+        "multi_polynomial",
+        "rbf",
+    )
+    """Methods fitted beside the network, to be held against it: a polynomial in T, one in all features, the traditional RBF; and
+    scikit-learn's Gaussian process and BayesianRidge, where it is installed."""
+    multi_polynomial_degrees: tuple[Count, ...] = Field(default=(1, 2, 3), min_length=1)
+    """Degrees among which cross-validation chooses for the polynomial in all features."""
     polynomial_degrees: tuple[Count, ...] = Field(default=(1, 2, 3, 4, 5), min_length=1)
     """Degrees among which cross-validation chooses for the polynomial in T."""
     rbf_nodes: tuple[Count, ...] = Field(default=(4, 6, 10, 15, 25, 40), min_length=1)

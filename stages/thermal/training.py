@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.records import Chamber
-from stages.thermal.baselines import fit_polynomial, fit_traditional_rbf
+from stages.thermal.baselines import fit_multi_polynomial, fit_polynomial, fit_traditional_rbf
 from stages.thermal.features import STEPS_PER_TIME_CONSTANT, channel_features, stuck_thermometers
 from stages.thermal.model import ChannelModel, Predictor, ThermalModel
 from stages.thermal.network import BayesianRbf, fit_network
+from stages.thermal.oracles import fit_gaussian_process, fit_ridge
 from stages.thermal.settings import ThermalSettings
 from stages.thermal.targets import CHANNELS, bias_samples, block_means, refuse_motion, thinned
 
@@ -84,19 +85,23 @@ def fit_channel(
     predictors: dict[str, Predictor] = {}
     if teach:
         x = ((features - mean) / scale)[:, used]
-        predictors = {
-            "polynomial": fit_polynomial(x, bias, settings.polynomial_degrees),
-            "rbf": fit_traditional_rbf(x, bias, settings.rbf_nodes, settings.rbf_widths, settings.seed),
-            "bayesian_rbf": fit_network(
-                x,
-                bias,
-                starts=starts,
-                centres=settings.centres,
-                start_widths=settings.start_widths,
-                iterations=settings.iterations,
-                device=settings.device,
-            ),
+        fits: dict[str, Callable[[], Predictor]] = {
+            "polynomial": lambda: fit_polynomial(x, bias, settings.polynomial_degrees),
+            "multi_polynomial": lambda: fit_multi_polynomial(x, bias, settings.multi_polynomial_degrees),
+            "rbf": lambda: fit_traditional_rbf(x, bias, settings.rbf_nodes, settings.rbf_widths, settings.seed),
+            "gaussian_process": lambda: fit_gaussian_process(x, bias, settings.seed),
+            "bayesian_ridge": lambda: fit_ridge(x, bias, settings.seed),
         }
+        predictors = {name: fit() for name, fit in fits.items() if name in settings.baselines}
+        predictors["bayesian_rbf"] = fit_network(
+            x,
+            bias,
+            starts=starts,
+            centres=settings.centres,
+            start_widths=settings.start_widths,
+            iterations=settings.iterations,
+            device=settings.device,
+        )
     return ChannelModel(used, mean, scale, low - margin, high + margin, prior, predictors)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.records import Chamber
 from stages.thermal.features import STEPS_PER_TIME_CONSTANT
-from stages.thermal.model import METHODS, ThermalModel
+from stages.thermal.model import ThermalModel
 from stages.thermal.network import BayesianRbf
 from stages.thermal.targets import bias_samples, block_means, refuse_motion, thinned
 from tsmftis.inertial import DEG_PER_H, MICRO_G
@@ -34,7 +34,7 @@ def verify_run(model: ThermalModel, chamber: Chamber, seconds: float) -> dict[st
     raw = means(bias)
     left = {}
     sigma = np.empty_like(raw)
-    for method in METHODS:
+    for method in model.methods:
         predicted = [c.predict(f, method) for c, f in zip(model.channels, features, strict=True)]
         left[method] = raw - means(np.column_stack([mean for mean, _ in predicted]))
         if method == "bayesian_rbf":
@@ -61,7 +61,7 @@ def verification_table(runs: Sequence[dict[str, Any]]) -> dict[str, dict[str, li
     if not runs:
         return {}
     table: dict[str, dict[str, list[float]]] = {"gyro_std_deg_per_h": {}, "accel_std_ug": {}}
-    for method in ("raw", *METHODS):
+    for method in ("raw", *runs[0]["left"]):
         left = np.vstack([run["raw"] if method == "raw" else run["left"][method] for run in runs])
         deviation = left.std(axis=0)
         table["gyro_std_deg_per_h"][method] = (deviation[:3] / DEG_PER_H).tolist()

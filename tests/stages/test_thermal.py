@@ -266,7 +266,7 @@ def test_held_out_profile_reaches_the_noise_floor(result: ThermalResult) -> None
     gyro = {k: np.array(v) / 0.006 for k, v in result.verification["gyro_std_deg_per_h"].items()}
     accel = {k: np.array(v) / 1.2 for k, v in result.verification["accel_std_ug"].items()}
     for figures in (gyro, accel):
-        assert list(figures) == ["raw", "polynomial", "rbf", "bayesian_rbf"]
+        assert list(figures) == ["raw", "polynomial", "multi_polynomial", "rbf", "bayesian_rbf"]
         assert np.median(figures["bayesian_rbf"]) <= 1.15
         assert figures["bayesian_rbf"].max() <= 1.35
         for worse in ("raw", "polynomial", "rbf"):
