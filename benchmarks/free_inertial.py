@@ -22,11 +22,10 @@ import numpy as np
 import simulated
 from numpy.typing import NDArray
 
-from pipeline.records import Chamber, Imu, StaticAttitude, Temperatures, ThermalCorrection
+from pipeline.records import Imu, Temperatures, ThermalCorrection
 from stages import thermal
 from stages.navigation import NavigationSettings, run
 from stages.simulation import SimulationSettings, sensors
-from stages.simulation.records import ChamberRun
 from tsmftis.camera import Mounting
 from tsmftis.simulator import effects
 from tsmftis.simulator import thermal as warmth
@@ -46,20 +45,6 @@ STEADY = replace(
 UNITS = {"biases wander as declared": WANDERING, "thermal bias and noise alone": STEADY}
 
 
-def chamber(run_: ChamberRun, name: str) -> Chamber:
-    place, r = SETTINGS.chamber, run_.inertial
-    angles = np.deg2rad([place.latitude_deg, place.roll_deg, place.pitch_deg, place.yaw_deg])
-    return Chamber(
-        name,
-        r.time,
-        r.gyro,
-        r.accel,
-        Temperatures(r.time, r.temperature_gyro, r.temperature_accel),
-        StaticAttitude(angles[0], place.height_m, *map(float, angles[1:])),
-        run_.temperature_chamber,
-    )
-
-
 @cache
 def flown(number: int) -> tuple[Any, Imu, Any]:
     """A flight, perfect inertial data, and fixes with their errors."""
@@ -77,7 +62,9 @@ def one(seed: int) -> dict[tuple[str, str], tuple[float, float]]:
     none = effects.complete({})
     unit = sensors.draw_sensors(SETTINGS, none, seed)
     chambers = [
-        chamber(sensors.record_chamber(SETTINGS, profile, unit, stream(seed, "chamber", name)), name)
+        simulated.chamber(
+            sensors.record_chamber(SETTINGS, profile, unit, stream(seed, "chamber", name)), SETTINGS, name
+        )
         for name, profile in (("train", SETTINGS.chamber.train), ("verify", SETTINGS.chamber.verify))
     ]
     fitted = thermal.run(chambers[:1], chambers[1:], thermal.ThermalSettings())

@@ -1,4 +1,4 @@
-"""Flights whose truth is known, for the benchmarks and the tests of the POS: motion, inertial data, fixes, errors.
+"""Flights whose truth is known, for the benchmarks and the tests of the POS: motion, inertial data, fixes, chamber runs, errors.
 
 The motion is worked out by `tsmftis.simulator` (inertial frame, exact derivatives); it shares geodesy and rotations with the
 POS and nothing else.
@@ -6,7 +6,7 @@ POS and nothing else.
 Functions
 ---------
 aircraft, survey, drive, racetrack      motions
-ideal, measured, fixes                  what perfect and real sensors say of them
+ideal, measured, fixes, chamber         what perfect and real sensors say of them, and in the chamber
 truth, errors, consistency              the true path; truth minus estimate; NEES
 """
 
@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from pipeline.records import Gnss, Imu, Trajectory
+from pipeline.records import Chamber, Gnss, Imu, StaticAttitude, Temperatures, Trajectory
 from stages.navigation import kalman
 from stages.navigation.solve import Solution
 from stages.simulation import SimulationSettings
+from stages.simulation.records import ChamberRun
 from stages.simulation.sensors import fly
 from tsmftis import geodesy
 from tsmftis.inertial import DEG_PER_H, MICRO_G, ImuModel, SensorModel
@@ -227,6 +228,21 @@ def fixes(
     sigma_r, sigma_v = np.tile(SIGMA_POSITION, (time.size, 1)), np.tile(SIGMA_VELOCITY, (time.size, 1))
     extra = (seen.velocity, sigma_v) if velocity else (None, None)
     return Gnss(seen.time, *seen.geodetic.T, sigma_r, *extra, np.ones(time.size, np.int64))
+
+
+def chamber(run: ChamberRun, settings: SimulationSettings, name: str) -> Chamber:
+    """A simulated chamber run as the pipeline's record."""
+    place, r = settings.chamber, run.inertial
+    angles = np.deg2rad([place.latitude_deg, place.roll_deg, place.pitch_deg, place.yaw_deg])
+    return Chamber(
+        name,
+        r.time,
+        r.gyro,
+        r.accel,
+        Temperatures(r.time, r.temperature_gyro, r.temperature_accel),
+        StaticAttitude(angles[0], place.height_m, *map(float, angles[1:])),
+        run.temperature_chamber,
+    )
 
 
 def attitude_known_to(craft: flight.Flight, sigma: Array, rng: np.random.Generator) -> tuple[float, Array, Array]:

@@ -16,12 +16,12 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import simulated
 from numpy.typing import NDArray
 
-from pipeline.records import Chamber, StaticAttitude, Temperatures
+from pipeline.records import Chamber, Temperatures
 from stages import thermal
 from stages.simulation import SimulationSettings, sensors
-from stages.simulation.records import ChamberRun
 from stages.simulation.settings import AirProfile
 from stages.thermal.targets import bias_samples, block_means
 from tsmftis.simulator import effects
@@ -47,21 +47,6 @@ BEYOND = AirProfile.model_validate(
 )
 
 
-def chamber(run: ChamberRun, settings: SimulationSettings, name: str) -> Chamber:
-    """A simulated run as the pipeline's record."""
-    place, r = settings.chamber, run.inertial
-    angles = np.deg2rad([place.latitude_deg, place.roll_deg, place.pitch_deg, place.yaw_deg])
-    return Chamber(
-        name,
-        r.time,
-        r.gyro,
-        r.accel,
-        Temperatures(r.time, r.temperature_gyro, r.temperature_accel),
-        StaticAttitude(angles[0], place.height_m, *map(float, angles[1:])),
-        run.temperature_chamber,
-    )
-
-
 def instrument(seed: int, settings: SimulationSettings) -> dict[str, tuple[Chamber, Array]]:
     """Three runs of one instrument, each with its true bias (n, 6)."""
     unit = sensors.draw_sensors(settings, effects.complete({}), seed)
@@ -69,7 +54,7 @@ def instrument(seed: int, settings: SimulationSettings) -> dict[str, tuple[Chamb
     out = {}
     for name, profile in profiles.items():
         run = sensors.record_chamber(settings, profile, unit, stream(seed, "chamber", name))
-        out[name] = chamber(run, settings, name), np.hstack([run.gyro_bias, run.accel_bias])
+        out[name] = simulated.chamber(run, settings, name), np.hstack([run.gyro_bias, run.accel_bias])
     return out
 
 
