@@ -60,7 +60,7 @@ def fit(
         values = (row["channel"], row["n"], row["m"], f"{row['gamma']:.1f}", f"{sigma:.3g}", "°/h" if gyro else "µg")
         table.add_row(*map(str, values))
     console = Console(highlight=False, soft_wrap=True)
-    console.print(table)
+    Console(highlight=False, width=110).print(table)
     for note in result.notes:
         console.print(note, markup=False)
     console.print(f"{out}: six channels, thermometers' features smoothed over {settings.smoothing_s:g} s", markup=False)
@@ -80,7 +80,8 @@ def verify(model: Model, chambers: Runs) -> None:
     for method in table["gyro_std_deg_per_h"]:
         values = [*table["gyro_std_deg_per_h"][method], *table["accel_std_ug"][method]]
         shown.add_row(method.replace("_", " "), *(f"{v:.4g}" for v in values))
-    Console(highlight=False, soft_wrap=True).print(shown)
+    # As wide as it is, also where the output goes to a file or a narrow window.
+    Console(highlight=False, width=110).print(shown)
 
 
 @app.command("apply")

@@ -16,7 +16,7 @@ from stages.navigation.alignment import Start, align, heading_at_rest, starting_
 from stages.navigation.clocks import refuse_jumps
 from stages.navigation.measurements import withheld
 from stages.navigation.settings import NavigationSettings
-from stages.navigation.solve import Problem, Solution, likelihood, solve
+from stages.navigation.solve import Problem, Solution, filled, likelihood, solve
 from stages.navigation.standstill import Standstill, find
 from stages.navigation.velocity import moves
 from tsmftis.camera import Mounting
@@ -114,9 +114,16 @@ def smooth(
         return _start(imu, kept, lever, model, still, settings, initial, offset)
 
     start = start_at(0.0)
-    problem = Problem(
-        _from(imu, start.time), gnss, model, settings, still.after(start.time), start, as_declared, theta, late
-    )
+    later = int(((kept.time > start.time) & (kept.time <= imu.time[-1])).sum())
+    if later < 5:
+        raise InputError(
+            "gnss",
+            "variable 'time'",
+            f"has {later} fixes that are not withheld between the start at {start.time:.1f} s and the end of the inertial data",
+            "start earlier, or withhold fewer",
+        )
+    used = _from(filled(imu), start.time)
+    problem = Problem(used, gnss, model, settings, still.after(start.time), start, as_declared, theta, late)
     return _repeated(_surest_heading(problem, kept, start_at, initial is None))
 
 

@@ -481,3 +481,9 @@ def test_a_parked_coarse_unit_does_not_invent_a_heading() -> None:
         _, _, turn = errors(craft, t._at(np.array([6000])))
         sigma = float(t.sigma_attitude[6000, 2])
         assert np.rad2deg(sigma) > 7.0 and abs(turn[0, 2]) < 3.0 * sigma
+
+
+def test_a_start_with_hardly_a_fix_behind_it_is_refused() -> None:
+    _, imu, gnss, initial = recorded("aircraft")
+    with pytest.raises(InputError, match=r"has 2 fixes that are not withheld between the start at 110\.4 s"):
+        solve(imu, gnss, (110.4, *initial[1:]))
