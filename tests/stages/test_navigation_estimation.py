@@ -297,7 +297,7 @@ def test_g_sensitivity_is_estimated_where_it_is_asked_for() -> None:
     data = simulated.measured(imu, RLG.model, rng, inertial.UnitErrors(np.zeros(3), np.zeros(3), true))
     groups = (*states.DEFAULT_GROUPS, "gyro_g_sensitivity")
     result = solve(data, gnss, initial, RLG, estimate=groups, g_sensitivity_sigma_deg_per_h_per_g=30.0)
-    shown = result.figures["parameters"]["gyro_g_sensitivity"]  # type: ignore[call-overload]
+    shown = result.figures["parameters"]["gyro_g_sensitivity"]
     value, sigma = (np.array(shown[key])[:, -1] for key in ("value", "sigma"))
     print("g-sensitivity", value / true[2], sigma / true[2])
     assert np.abs((value - true) / sigma).max() < 3.0
