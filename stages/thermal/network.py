@@ -20,6 +20,9 @@ The noise of successive blocks may be correlated: with r_t = ρ·r_{t−1} + …
 is of the largest evidence too (weights integrated out, so this is restricted maximum likelihood): N in the evidence then
 counts information and not samples.
 
+ℓ, ρ, α, β are not known exactly. The mean is that of the most probable ones; the variance is that of a sample of networks drawn
+by evidence (`hyperparameters.py`), about this mean: Σ_k p_k·(σ_k² + (δ_k − δ)²).
+
 References
 ----------
 .. [1] D. J. C. MacKay, A practical Bayesian framework for backpropagation networks, Neural Computation 4 (1992) 448.
@@ -40,85 +43,96 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
-from stages.thermal.evidence import log_evidence, posterior, reestimate
+from stages.thermal.evidence import Posterior, log_evidence, posterior, reestimate
+from stages.thermal.hyperparameters import alternatives
 
 Array = NDArray[np.float64]
 
 # On the diagonal of K: far below any noise the data can have against the signal, far above rounding.
 JITTER = 1e-8
-# Weak log-normal priors: widths around 3 standard deviations of their input, ρ around 1, each within a factor of e².
+# Weak log-normal priors: widths around 3 standard deviations of their input, the linear units a little less likely than the
+# Gaussian ones, each within a factor of e².
 LOG_WIDTH_MEAN, LOG_WIDTH_SIGMA = math.log(3.0), 2.0
-LOG_RATIO_MEAN, LOG_RATIO_SIGMA = 0.0, 2.0
+LOG_RATIO_MEAN, LOG_RATIO_SIGMA = -2.0, 2.0
 # Linear units go on this far outside the envelope, in standard deviations of a feature.
 LINEAR_MARGIN = 1.0
 PREDICT_ROWS = 8192
+ALTERNATIVES = 12
 
 
 @dataclass(frozen=True)
 class BayesianRbf:
-    """A trained network of m Gaussian and D linear units, M = m + D.
+    """K networks of m Gaussian and D linear units, M = m + D, on the same centres: the most probable and some as likely.
 
-    centres (m, D), widths (D,), low and high (D,), where the linear units stop, in scaled features; `mixing` U (m, m);
-    weights w (M,); `factor` F (M, M) with F·Fᵀ = H⁻¹; `ratio` ρ; `constant` c and `scale` in the target's unit: all
-    else is of (target − c)/scale. `count` is N; `correlation` that of one block's noise with the next one's.
+    centres (m, D), low and high (D,), where the linear units stop, in scaled features. By network, the most probable one first:
+    `share` p (K,), widths (K, D), `mixing` U (K, m, m); weights w (K, M); `factor` F (K, M, M) with F·Fᵀ = H⁻¹; α, β, γ,
+    `ratio` ρ of the linear units, `correlation` of one block's noise with the next one's (K,). `constant` c and `scale` are in
+    the target's unit: all else is of (target − c)/scale. `count` is N.
     """
 
     centres: Array
-    widths: Array
     low: Array
     high: Array
+    share: Array
+    widths: Array
     mixing: Array
     weights: Array
     factor: Array
-    alpha: float
-    beta: float
-    gamma: float
-    ratio: float
+    alpha: Array
+    beta: Array
+    gamma: Array
+    ratio: Array
+    correlation: Array
     constant: float
     scale: float
     count: int
-    correlation: float
     log_evidence: float
 
     @property
     def noise_sigma(self) -> float:
         """Standard deviation of a target's noise, in the target's unit: √(1/(2β))."""
-        return self.scale * math.sqrt(0.5 / self.beta)
+        return self.scale * math.sqrt(float(self.share @ (0.5 / self.beta)))
 
     @property
     def informative(self) -> float:
         """How many independent targets the N correlated ones are worth: N·(1 − ρ)/(1 + ρ)."""
-        return self.count * (1.0 - self.correlation) / (1.0 + self.correlation)
+        return self.count / self._inflation
+
+    @property
+    def _inflation(self) -> float:
+        return float(self.share @ ((1.0 + self.correlation) / (1.0 - self.correlation)))
 
     def noise_of_mean(self, blocks: float) -> float:
         """Standard deviation of the noise in a mean over as long as `blocks` targets: σ/√blocks, more where it is correlated."""
-        inflation = (1.0 + self.correlation) / (1.0 - self.correlation)
-        independent = blocks if blocks < 1.0 else max(blocks / inflation, 1.0)
+        independent = blocks if blocks < 1.0 else max(blocks / self._inflation, 1.0)
         return self.noise_sigma / math.sqrt(independent)
 
     def predict(self, features: Array) -> tuple[Array, Array]:
         """Mean and standard deviation (n,) of the function at scaled features (n, D), in the target's unit."""
-        mean, variance = np.empty(len(features)), np.empty(len(features))
-        scaled = self.centres / self.widths
-        size = len(scaled)
-        phi = np.empty((min(PREDICT_ROWS, len(features)), size + features.shape[1]))
+        means, variances = self.members(features)
+        mean = means[0]
+        # The constant is a mean of N targets and no surer than that.
+        constant = (self.noise_sigma / self.scale) ** 2 / self.informative
+        variance = self.share @ (variances + (means - mean) ** 2) + constant
+        return self.constant + self.scale * mean, self.scale * np.sqrt(variance)
+
+    def members(self, features: Array) -> tuple[Array, Array]:
+        """Mean and variance (K, n) by each network, of (target − c)/scale."""
+        means, variances = (np.empty((len(self.share), len(features))) for _ in range(2))
         for start in range(0, len(features), PREDICT_ROWS):
             part = slice(start, start + PREDICT_ROWS)
             x = features[part]
             held = np.clip(x, self.low, self.high)
-            phi = phi[: len(x)]
-            square = np.zeros((len(x), size))
-            for d in range(x.shape[1]):
-                square += (x[:, d, None] / self.widths[d] - scaled[:, d]) ** 2
-            phi[:, :size] = np.exp(-0.5 * square) @ self.mixing
-            phi[:, size:] = self.ratio * held
-            mean[part] = phi @ self.weights
-            unknown = np.maximum(1.0 - (phi[:, :size] ** 2).sum(axis=1), 0.0)
-            unknown += self.ratio**2 * ((x - held) ** 2).sum(axis=1)
-            variance[part] = ((phi @ self.factor) ** 2).sum(axis=1) + unknown / (2.0 * self.alpha)
-        # The constant is a mean of N targets and no surer than that.
-        variance += 0.5 / self.beta / self.informative
-        return self.constant + self.scale * mean, self.scale * np.sqrt(variance)
+            beyond = ((x - held) ** 2).sum(axis=1)
+            apart = (x.T[:, :, None] - self.centres.T[:, None]) ** 2
+            for k in range(len(self.share)):
+                square = np.tensordot(0.5 / self.widths[k] ** 2, apart, axes=1)
+                gaussian = np.exp(-square) @ self.mixing[k]
+                phi = np.hstack([gaussian, self.ratio[k] * held])
+                unknown = np.maximum(1.0 - (gaussian**2).sum(axis=1), 0.0) + self.ratio[k] ** 2 * beyond
+                means[k, part] = phi @ self.weights[k]
+                variances[k, part] = ((phi @ self.factor[k]) ** 2).sum(axis=1) + unknown / (2.0 * self.alpha[k])
+        return means, variances
 
 
 def spread_points(features: Array, count: int) -> NDArray[np.int64]:
@@ -171,6 +185,82 @@ def whitened(values: Tensor, correlation: Tensor | float, starts: Tensor) -> Ten
     return torch.cat([values[:1], torch.where(mask, values[1:], inner)])
 
 
+@dataclass(frozen=True)
+class _Task:
+    """Features x (N, D) and scaled targets y (N,) as tensors, and where runs begin; p = (ln ℓ (D,), ln ρ, artanh of the noise's
+    correlation, ln α, ln β)."""
+
+    x: Tensor
+    y: Tensor
+    starts: Tensor
+
+    @property
+    def dimensions(self) -> int:
+        return self.x.shape[1]
+
+    @property
+    def bounds(self) -> list[tuple[float, float]]:
+        """Prior variance between 1e-4 and 1e4 of the target's, noise between 1e-7 and 10: H stays well conditioned."""
+        widths = [(math.log(0.05), math.log(100.0))] * self.dimensions
+        noise = [(math.log(0.5e-4), math.log(0.5e4)), (math.log(0.05), math.log(0.5e7))]
+        return [*widths, (-6.0, 6.0), (0.0, 2.0), *noise]
+
+    def tensor(self, a: Array) -> Tensor:
+        return torch.as_tensor(a, dtype=torch.float64, device=self.x.device)
+
+    def whitened(self, q: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+        """Design (N, M) and target (N,) freed of the noise's colour."""
+        d = self.dimensions
+        design = torch.cat([_orthonormal(self.x, centres, q[:d]), q[d].exp() * self.x], dim=1)
+        correlation = q[-3].tanh()
+        return whitened(design, correlation, self.starts), whitened(self.y, correlation, self.starts)
+
+    def volume(self, q: Tensor) -> Tensor:
+        """ln of the determinant of the whitening, which the evidence of the whitened targets lacks."""
+        return -0.5 * (~self.starts).sum() * torch.log(1.0 - q[-3].tanh() ** 2)
+
+    def cost(self, q: Tensor, centres: Tensor) -> Tensor:
+        """−ln evidence − ln prior."""
+        d = self.dimensions
+        prior = ((q[:d] - LOG_WIDTH_MEAN) / LOG_WIDTH_SIGMA).square().sum()
+        prior = prior + ((q[d] - LOG_RATIO_MEAN) / LOG_RATIO_SIGMA).square()
+        return 0.5 * prior - log_evidence(*self.whitened(q, centres), q[-2], q[-1]) - self.volume(q)
+
+    def value(self, p: Array, centres: Tensor) -> float:
+        with torch.no_grad():
+            return float(self.cost(self.tensor(p), centres))
+
+    def slope(self, p: Array, centres: Tensor) -> tuple[float, Array]:
+        """The cost and its gradient."""
+        q = self.tensor(p).requires_grad_(True)
+        cost = self.cost(q, centres)
+        cost.backward()
+        assert q.grad is not None
+        return float(cost.detach()), q.grad.cpu().numpy()
+
+    def search(self, start: Array, centres: Tensor, iterations: int) -> tuple[float, Array]:
+        """The least cost from a start, and where it is."""
+        options = {"maxiter": iterations}
+        fit = minimize(
+            self.slope, start, args=(centres,), jac=True, method="L-BFGS-B", bounds=self.bounds, options=options
+        )
+        return float(fit.fun), np.asarray(fit.x)
+
+    def network(self, p: Array, centres: Tensor, settled: bool) -> tuple[Posterior, Array, float]:
+        """Weights at p, with α and β at their own maximum where `settled`; U; ln evidence."""
+        q = self.tensor(p)
+        design, target = self.whitened(q, centres)
+        given = posterior(design, target, float(q[-2].exp()), float(q[-1].exp()))
+        found = reestimate(design, target, given.alpha, given.beta) if settled else given
+        if not (found.alpha < 1e9 and found.beta < 1e9):
+            # Without signal or without noise the fixed point runs away: the bounded values of the search stand.
+            found = given
+        log_alpha, log_beta = (self.tensor(np.log(v)) for v in (found.alpha, found.beta))
+        evidence = log_evidence(design, target, log_alpha, log_beta) + self.volume(q)
+        mixing = torch.linalg.inv(_cholesky(centres, q[: self.dimensions])).T
+        return found, mixing.cpu().numpy(), float(evidence)
+
+
 def fit_network(
     features: Array,
     target: Array,
@@ -179,98 +269,65 @@ def fit_network(
     centres: tuple[int, ...] = (20, 40, 80),
     start_widths: tuple[tuple[float, float], ...] = ((0.5, 5.0), (2.0, 2.0)),
     iterations: int = 100,
+    seed: int = 0,
     device: str = "cpu",
 ) -> BayesianRbf:
     """Train on scaled features (N, D) and targets (N,): widths, noise and its colour by evidence from each start, the best kept.
 
     A start is a pair of widths: of the first feature (T) and of the others. `starts` (N,) marks the first block of each run; one
     run where it is left out. The number of Gaussian units is the smallest of `centres` whose evidence is within a nat of the
-    best.
+    best. `seed` is of the sample of hyperparameters.
     """
     constant, scale = float(target.mean()), float(target.std()) or 1.0
     dimensions = features.shape[1]
     if starts is None:
         starts = np.arange(len(target)) == 0
-
-    def tensor(a: Array) -> Tensor:
-        return torch.as_tensor(a, dtype=torch.float64, device=device)
-
     with one_thread():
-        x, y, first_of_run = (
-            tensor(features),
-            tensor((target - constant) / scale),
-            torch.as_tensor(starts, device=device),
-        )
-        later = int((~starts).sum())
-
-        def design(q: Tensor, c: Tensor) -> Tensor:
-            return torch.cat([_orthonormal(x, c, q[:dimensions]), q[dimensions].exp() * x], dim=1)
-
-        def objective(p: Array, c: Tensor) -> tuple[float, Array]:
-            """−ln evidence − ln prior of (ln ℓ, ln ρ, artanh of the noise's correlation, ln α, ln β), and its gradient."""
-            q = tensor(p).requires_grad_(True)
-            prior = ((q[:dimensions] - LOG_WIDTH_MEAN) / LOG_WIDTH_SIGMA).square().sum()
-            prior = prior + ((q[dimensions] - LOG_RATIO_MEAN) / LOG_RATIO_SIGMA).square()
-            correlation = q[-3].tanh()
-            phi, goal = (whitened(v, correlation, first_of_run) for v in (design(q, c), y))
-            evidence = log_evidence(phi, goal, q[-2], q[-1]) - 0.5 * later * torch.log(1.0 - correlation**2)
-            loss = 0.5 * prior - evidence
-            loss.backward()
-            assert q.grad is not None
-            return float(loss.detach()), q.grad.cpu().numpy()
-
-        # Prior variance between 1e-4 and 1e4 of the target's, noise between 1e-7 and 10: H stays well conditioned.
-        bounds = [(math.log(0.05), math.log(100.0))] * dimensions + [(-6.0, 6.0), (0.0, 2.0)]
-        bounds += [(math.log(0.5e-4), math.log(0.5e4)), (math.log(0.05), math.log(0.5e7))]
-
-        def search(start: Array, c: Tensor) -> tuple[float, Array]:
-            options = {"maxiter": iterations}
-            fit = minimize(objective, start, args=(c,), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-            return float(fit.fun), np.asarray(fit.x)
-
-        sizes = sorted({min(n, len(target)) for n in centres})
+        x, y = (torch.as_tensor(a, dtype=torch.float64, device=device) for a in (features, (target - constant) / scale))
+        task = _Task(x, y, torch.as_tensor(starts, device=device))
         begin = [
-            np.r_[np.log([first] + [others] * (dimensions - 1)), LOG_RATIO_MEAN, 0.1, math.log(2.0), math.log(50.0)]
+            np.r_[np.log([first] + [others] * (dimensions - 1)), 0.0, 0.1, math.log(2.0), math.log(50.0)]
             for first, others in start_widths
         ]
         fits: list[tuple[float, Array, Array]] = []
-        for n in sizes:
+        for n in sorted({min(n, len(target)) for n in centres}):
             middle = features[spread_points(features, n)]
-            c = tensor(middle)
+            c = task.tensor(middle)
             # More units go on from where fewer ended.
-            loss, best = min((search(p, c) for p in begin), key=lambda f: f[0])
-            fits.append((loss, best, middle))
+            cost, best = min((task.search(p, c, iterations) for p in begin), key=lambda f: f[0])
+            fits.append((cost, best, middle))
             begin = [best]
             if len(middle) < n:
                 break
         least = min(f[0] for f in fits)
         _, best, middle = next(f for f in fits if f[0] <= least + 1.0)
-
-        c, q = tensor(middle), tensor(best)
-        correlation = math.tanh(best[-3])
-        phi, goal = (whitened(v, correlation, first_of_run) for v in (design(q, c), y))
-        final = reestimate(phi, goal, float(q[-2].exp()), float(q[-1].exp()))
-        if not (final.alpha < 1e9 and final.beta < 1e9):
-            # Without signal or without noise the fixed point runs away: the bounded values of the search stand.
-            final = posterior(phi, goal, float(q[-2].exp()), float(q[-1].exp()))
-        evidence = float(log_evidence(phi, goal, tensor(np.log(final.alpha)), tensor(np.log(final.beta))))
-        evidence -= 0.5 * later * math.log(1.0 - correlation**2)
-        mixing = torch.linalg.inv(_cholesky(c, q[:dimensions])).T
+        c = task.tensor(middle)
+        others, share = alternatives(
+            lambda p: task.value(p, c),
+            lambda p: task.slope(p, c)[1],
+            best,
+            np.array(task.bounds),
+            ALTERNATIVES,
+            seed,
+        )
+        points = np.vstack([best, others])
+        made = [task.network(p, c, settled=k == 0) for k, p in enumerate(points)]
     return BayesianRbf(
         centres=middle,
-        widths=np.exp(best[:dimensions]),
         low=features.min(axis=0) - LINEAR_MARGIN,
         high=features.max(axis=0) + LINEAR_MARGIN,
-        mixing=mixing.cpu().numpy(),
-        weights=final.weights.cpu().numpy(),
-        factor=final.factor.cpu().numpy(),
-        alpha=final.alpha,
-        beta=final.beta,
-        gamma=final.gamma,
-        ratio=float(q[dimensions].exp()),
+        share=np.r_[0.0, share],
+        widths=np.exp(points[:, :dimensions]),
+        mixing=np.stack([mixing for _, mixing, _ in made]),
+        weights=np.stack([p.weights.cpu().numpy() for p, _, _ in made]),
+        factor=np.stack([p.factor.cpu().numpy() for p, _, _ in made]),
+        alpha=np.array([p.alpha for p, _, _ in made]),
+        beta=np.array([p.beta for p, _, _ in made]),
+        gamma=np.array([p.gamma for p, _, _ in made]),
+        ratio=np.exp(points[:, dimensions]),
+        correlation=np.tanh(points[:, -3]),
         constant=constant,
         scale=scale,
         count=len(target),
-        correlation=correlation,
-        log_evidence=evidence - len(target) * math.log(scale),
+        log_evidence=made[0][2] - len(target) * math.log(scale),
     )

@@ -53,6 +53,6 @@ class ThermalSettings(BaseModel):
     rbf_widths: tuple[Positive, ...] = Field(default=(0.7, 1.0, 1.5, 2.5, 4.0, 7.0), min_length=1)
     """Widths among which cross-validation chooses for the traditional RBF, in standard deviations of the features."""
     seed: Annotated[int, Field(ge=0)] = 0
-    """Of the k-means that places the traditional RBF's nodes; the Bayesian network needs none."""
+    """Of the k-means that places the traditional RBF's nodes, and of the sample of hyperparameters."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the Bayesian network is trained."""

@@ -100,6 +100,7 @@ def fit_channel(
             centres=settings.centres,
             start_widths=settings.start_widths,
             iterations=settings.iterations,
+            seed=settings.seed,
             device=settings.device,
         )
     return ChannelModel(used, mean, scale, low - margin, high + margin, prior, predictors)
@@ -131,9 +132,10 @@ def fit_model(
             continue
         network = channels[i].predictors["bayesian_rbf"]
         assert isinstance(network, BayesianRbf)
-        if network.correlation > COLOURED:
+        correlation = float(network.correlation[0])
+        if correlation > COLOURED:
             notes.append(
-                f"Channel {name}: the noise of one block correlates with the next by {network.correlation:.2f}, so its "
+                f"Channel {name}: the noise of one block correlates with the next by {correlation:.2f}, so its "
                 f"{network.count} blocks count as {network.informative:.0f}: the noise is coloured, or the bias has a memory "
                 "that this model lacks."
             )
@@ -141,15 +143,15 @@ def fit_model(
             {
                 "channel": name,
                 "n": network.count,
-                "m": len(network.weights),
-                "alpha": network.alpha,
-                "beta": network.beta,
-                "gamma": network.gamma,
+                "m": network.weights.shape[1],
+                "alpha": float(network.alpha[0]),
+                "beta": float(network.beta[0]),
+                "gamma": float(network.gamma[0]),
                 "log_evidence": network.log_evidence,
-                "widths": network.widths.tolist(),
-                "linear_ratio": network.ratio,
+                "widths": network.widths[0].tolist(),
+                "linear_ratio": float(network.ratio[0]),
                 "noise_sigma": network.noise_sigma,
-                "noise_correlation": network.correlation,
+                "noise_correlation": correlation,
             }
         )
     return model, table, notes
