@@ -28,6 +28,7 @@ from pipeline.model_update import Effects
 from pipeline.raster import Dem, Quicklook, open_cube
 from pipeline.records import CameraPoses, Imu, Spectra, ThermalCorrection, Tracks, Trajectory
 from pipeline.run_stage import StageRecord, run_stage, write_json
+from pipeline.truth import read_true_poses, true_poses_file
 from stages import bench as bench_stage
 from stages import mapping, navigation, reconstruction, registration, scoring, thermal, tracking
 from tsmftis import __version__
@@ -69,6 +70,7 @@ class Plan:
     only: str | None = None  # --only: this stage alone
     lines: tuple[str, ...] = ()  # --line: LINE or FLIGHT/LINE; empty: all
     update: Effects = field(default_factory=dict)  # --model-update: what the declared models lack
+    truth: Path | None = None  # --truth: folder with true poses, of which the method `true` is made
 
     @cached_property
     def opened(self) -> Campaign:
@@ -153,13 +155,15 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
     }
     if update := plan.effects("navigation"):
         about["model_update"] = json.dumps(update, sort_keys=True)
-    if compensated := campaign.keys.thermal is not None and _has_temperatures(campaign, flight):
+    method = plan.settings.thermal.method
+    declared = campaign.keys.thermal is not None and _has_temperatures(campaign, flight)
+    if compensated := declared and method != "none":
         inputs["model"] = _needed(model, "thermal")
         outputs["correction"] = f"{flight}/thermal.nc"
 
     def work(to: Paths) -> dict[str, Any]:
         imu = campaign.imu(flight)
-        correction = _correction(model, imu) if compensated else None
+        correction = _correction(model, imu, method) if compensated else None
         assert instrument.imu is not None and instrument.mounting is not None
         with _naming(gnss=inputs["gnss"], imu=inputs["imu"], **{"campaign.yaml": campaign.root / "campaign.yaml"}):
             result = navigation.run(
@@ -188,6 +192,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         {
             "settings": _plain(plan.settings.navigation),
             "effects": plan.effects("navigation"),
+            "thermal": method,
             "about": about,
             "imu": _plain(instrument.imu),
             "initial": _plain(entry.initial),
@@ -202,21 +207,30 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
 
 
 def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
-    """Trajectory, frame times and targets → pos_tracks.nc (nominal and tracking), poses.nc (camera), events.csv (unit)."""
+    """Trajectory, frame times and targets → pos_tracks.nc (nominal, tracking, true), poses.nc (camera), events.csv (unit)."""
     campaign = plan.opened
     entry, instrument = campaign.line(flight, line), campaign.instrument
     trajectory = plan.out / flight / "trajectory.nc"
+    inputs = {
+        "trajectory": _needed(trajectory, "navigation"),
+        "frames": campaign.path(entry.frames),
+        "targets": campaign.path(entry.targets),
+    }
+    if plan.truth is not None and (path := true_poses_file(plan.truth, line)) is not None:
+        inputs["truth"] = path
 
     def work(to: Paths) -> dict[str, Any]:
         assert instrument.camera is not None and instrument.mounting is not None
-        with _naming(frames=campaign.path(entry.frames), targets=campaign.path(entry.targets)):
+        stamps = campaign.frames(flight, line).time
+        with _naming(frames=inputs["frames"], targets=inputs["targets"]):
             result = tracking.run(
                 Trajectory.from_file(trajectory),
-                campaign.frames(flight, line).time,
+                stamps,
                 campaign.targets(flight, line),
                 instrument.camera,
                 instrument.mounting,
                 plan.settings.tracking,
+                read_true_poses(inputs["truth"], stamps.size) if "truth" in inputs else None,
             )
         write_dataset(result.tracks.to_dataset(), to["tracks"])
         write_dataset(result.poses.to_dataset(), to["poses"])
@@ -237,11 +251,7 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
             "camera": _plain(instrument.camera),
             "mounting": _plain(instrument.mounting),
         },
-        {
-            "trajectory": _needed(trajectory, "navigation"),
-            "frames": campaign.path(entry.frames),
-            "targets": campaign.path(entry.targets),
-        },
+        inputs,
         {
             "tracks": f"{flight}/{line}/pos_tracks.nc",
             "poses": f"{flight}/{line}/poses.nc",
@@ -467,9 +477,9 @@ def _has_temperatures(campaign: Campaign, flight: str) -> bool:
     return campaign.imu(flight).temperatures is not None
 
 
-def _correction(model: Path, imu: Imu) -> ThermalCorrection:
+def _correction(model: Path, imu: Imu, method: str) -> ThermalCorrection:
     assert imu.temperatures is not None
-    return thermal.ThermalModel.from_file(model).correction(imu.temperatures)
+    return thermal.ThermalModel.from_file(model).correction(imu.temperatures, method)
 
 
 def _reach(correction: ThermalCorrection) -> dict[str, Any]:

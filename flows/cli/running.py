@@ -21,6 +21,7 @@ from pipeline.errors import InputError
 from pipeline.inspect import check_campaign
 from pipeline.model_update import read_model_update
 from pipeline.run_stage import StageRecord
+from pipeline.truth import true_poses_file
 
 
 def run(
@@ -55,6 +56,10 @@ def run(
         Path | None,
         typer.Option("--settings", metavar="FILE", help="YAML file of settings (`tsmftis settings` prints one)."),
     ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", metavar="DIR", help="Folder of true poses (<line>.npz): adds the method `true`."),
+    ] = None,
 ) -> None:
     """Process a campaign. Only what changed since the last run into the same folder runs again.
 
@@ -68,8 +73,13 @@ def run(
     if start and only:
         raise InputError("--from", "with --only", "contradict each other", "give one of them")
     effects = read_model_update(update, UPDATED) if update is not None else {}
-    plan = Plan(campaign.resolve(), out.resolve(), settings, start, only, tuple(line or ()), effects)
     opened = read_campaign(campaign)
+    if truth is not None and not any(
+        true_poses_file(truth, entry.id) for f in opened.keys.flights for entry in f.lines
+    ):
+        raise InputError(truth, "--truth", "holds no <line>.npz of the campaign's lines", "give the truth folder")
+    known_truth = None if truth is None else truth.resolve()
+    plan = Plan(campaign.resolve(), out.resolve(), settings, start, only, tuple(line or ()), effects, known_truth)
     known = {i for f in opened.keys.flights for entry in f.lines for i in (entry.id, f"{f.id}/{entry.id}")}
     if unknown := [i for i in plan.lines if i not in known]:
         raise InputError(

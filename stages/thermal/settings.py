@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
@@ -44,6 +44,10 @@ class ThermalSettings(BaseModel):
     )
     """Methods fitted beside the network, to be held against it: a polynomial in T, one in all features, the traditional RBF; and
     scikit-learn's Gaussian process and BayesianRidge, where it is installed."""
+    method: Literal[
+        "bayesian_rbf", "gaussian_process", "bayesian_ridge", "rbf", "multi_polynomial", "polynomial", "none"
+    ] = "bayesian_rbf"
+    """What compensates the flights; it must be among those fitted. `none`: nothing does."""
     multi_polynomial_degrees: tuple[Count, ...] = Field(default=(1, 2, 3), min_length=1)
     """Degrees among which cross-validation chooses for the polynomial in all features."""
     polynomial_degrees: tuple[Count, ...] = Field(default=(1, 2, 3, 4, 5), min_length=1)
@@ -56,3 +60,9 @@ class ThermalSettings(BaseModel):
     """Of the k-means that places the traditional RBF's nodes, and of the sample of hyperparameters."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where the Bayesian network is trained."""
+
+    @model_validator(mode="after")
+    def _fitted(self) -> Self:
+        if self.method not in (*self.baselines, "bayesian_rbf", "none"):
+            raise ValueError(f"method {self.method} is not among baselines, so it is not fitted: add it there")
+        return self

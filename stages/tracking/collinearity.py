@@ -15,6 +15,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 from pipeline.errors import InputError, StageError
 from pipeline.records import DATA_GAP, CameraPoses, Targets, Tracks, Trajectory
+from pipeline.truth import TruePoses
 from tsmftis.camera import Camera, Mounting, camera_pose
 from tsmftis.geodesy import ecef_to_geodetic, geodetic_to_ecef, ned_to_ecef_dcm, radii_of_curvature
 from tsmftis.rotation import Attitude, dcm_to_rpy, rpy_to_dcm
@@ -54,8 +55,9 @@ def run(
     camera: Camera,
     mounting: Mounting,
     settings: TrackingSettings,
+    truth: TruePoses | None = None,
 ) -> TrackingResult:
-    """Tracks of every point of every target through the frames with these time stamps [s].
+    """Tracks of every point of every target through the frames with these time stamps [s]; by true poses too, if given.
 
     Raises InputError where the frames lie outside the trajectory or a target lies nowhere near the line.
     """
@@ -85,6 +87,9 @@ def run(
     row, col = project(points, poses, camera)
     nominal = nominal_track(row, col, time, camera, speed, float(np.nanmean(distance_down(points, poses))))
     tracks = Tracks(("nominal", "tracking"), targets.ids, np.stack([nominal[0], row]), np.stack([nominal[1], col]))
+    if truth is not None:
+        row, col = project(points, true_camera(time, truth, mounting), camera)
+        tracks = tracks.joined(Tracks(("true",), targets.ids, row[None], col[None]))
     return TrackingResult(tracks, poses, events, course, speed, float(np.nanmean(distance_down(points, poses))))
 
 
@@ -134,6 +139,13 @@ def camera_poses(events: Trajectory, mounting: Mounting) -> CameraPoses:
         mounting,
     )
     return CameraPoses(events.time, centre, dcm)
+
+
+def true_camera(time: Array, truth: TruePoses, mounting: Mounting) -> CameraPoses:
+    """The camera as mounted on the unit at its true poses."""
+    latitude, longitude, height = ecef_to_geodetic(truth.position)
+    to_ned = np.swapaxes(ned_to_ecef_dcm(latitude, longitude), -1, -2)
+    return CameraPoses(time, *camera_pose(latitude, longitude, height, to_ned @ truth.dcm, mounting))
 
 
 def mean_course(trajectory: Trajectory, start: float, stop: float) -> tuple[float, float]:
