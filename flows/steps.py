@@ -35,6 +35,7 @@ from tsmftis import __version__
 from tsmftis.effects import EFFECTS
 from tsmftis.fourier import smooth_phase
 
+FAR_FROM_CHAMBER = 0.5  # standard deviations of a feature
 UPDATED = frozenset({"navigation"})  # stages whose models take a model update
 
 # Each stage and the stages whose results it reads, in the order in which a reader should meet them.
@@ -182,7 +183,11 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         sbet.write_sbet(sbet.from_trajectory(result.trajectory), to["sbet"])
         smrmsg.write_smrmsg(smrmsg.from_trajectory(result.trajectory), to["smrmsg"])
         write_json(to["figures"], {"quality": result.quality, "figures": result.figures})
-        return result.quality | {"compensated": compensated} | (_reach(correction) if correction is not None else {})
+        if correction is None:
+            return result.quality | {"compensated": False}
+        reach = _reach(correction)
+        warnings = [*result.quality["warnings"], *_beyond(reach)]
+        return result.quality | {"compensated": True, "warnings": warnings} | reach
 
     return run_stage(
         plan.out,
@@ -490,6 +495,22 @@ def _reach(correction: ThermalCorrection) -> dict[str, Any]:
         "uncompensated": [n for n, column in zip(names, values.T, strict=True) if not column.any()],
         "chamber_distance_max": float(correction.distance.max()),
     }
+
+
+def _beyond(reach: Mapping[str, Any]) -> list[str]:
+    """What of that a reader must not miss."""
+    said = []
+    if reach["uncompensated"]:
+        names = ", ".join(reach["uncompensated"])
+        said.append(
+            f"left uncompensated, for want of a thermometer that moves or of a chamber run that teaches it: {names}"
+        )
+    if reach["chamber_distance_max"] > FAR_FROM_CHAMBER:
+        said.append(
+            f"temperatures go up to {reach['chamber_distance_max']:.1f} of their standard deviations beyond what the chamber "
+            "runs taught: the thermal correction holds its last trend there, with a wider sigma"
+        )
+    return said
 
 
 def _initial(campaign: Campaign, flight: str) -> tuple[float, np.ndarray, np.ndarray] | None:

@@ -48,6 +48,14 @@ def fit(
     writable(out)
     settings = load_settings(settings_file, assignments or []).thermal
     result = thermal.run(_read(chambers), [], settings)
+    taught = len(result.figures["training"])
+    if not taught:
+        raise InputError(
+            ", ".join(str(path) for path in chambers),
+            "temperatures",
+            "teach no channel anything: " + result.notes[-1].removesuffix("."),
+            "give a run in which the temperature moves",
+        )
     temporary = out.with_name(out.name + ".tmp")
     write_dataset(result.model.to_dataset(), temporary)
     os.replace(temporary, out)
@@ -63,7 +71,9 @@ def fit(
     Console(highlight=False, width=110).print(table)
     for note in result.notes:
         console.print(note, markup=False)
-    console.print(f"{out}: six channels, thermometers' features smoothed over {settings.smoothing_s:g} s", markup=False)
+    console.print(
+        f"{out}: {taught} of 6 channels, thermometers' features smoothed over {settings.smoothing_s:g} s", markup=False
+    )
 
 
 @app.command("verify")

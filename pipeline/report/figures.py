@@ -11,13 +11,13 @@ import plotly.graph_objects as go
 from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
-from pipeline.records import Frames, Interferograms, Spectra, Targets, Tracks, Trajectory
+from pipeline.records import Frames, Interferograms, Spectra, Targets, ThermalCorrection, Tracks, Trajectory
 from tsmftis.geodesy import STANDARD_GRAVITY, local_metres
 from tsmftis.inertial import DEG_PER_H, MICRO_G
 
 Array = NDArray[np.float64]
 
-COLOURS = {"nominal": "#8c8c8c", "registration": "#e07b00", "tracking": "#0b63b0", "reference": "#111111"}
+COLOURS = {"nominal": "#8c8c8c", "true": "#2a9d3a", "registration": "#e07b00", "tracking": "#0b63b0", "reference": "#111111"}
 SENSOR = {"raw": "#8c8c8c", "polynomial": "#b07aa1", "rbf": "#e07b00", "bayesian_rbf": "#0b63b0"}
 AXES = ("x", "y", "z")
 NED = ("north", "east", "down")
@@ -289,7 +289,7 @@ def thermal(runs: list[dict[str, Any]], sensor: str) -> go.Figure:
                 row=axis + 2,
                 col=1,
             )
-            for name in ("raw", "rbf", "bayesian_rbf"):
+            for name in ("raw", *(n for n in ("rbf", "bayesian_rbf") if n in run["left"])):
                 values = np.asarray(run["raw"] if name == "raw" else run["left"][name])[:, first + axis]
                 figure.add_scatter(
                     x=hours.tolist(),
@@ -306,6 +306,43 @@ def thermal(runs: list[dict[str, Any]], sensor: str) -> go.Figure:
         figure.update_yaxes(title=f"{sensor} {AXES[axis]} [{unit}]", row=axis + 2, col=1)
     figure.update_xaxes(title="time in the chamber [h]", row=4, col=1)
     return layout(figure, 760)
+
+
+def correction(taken: ThermalCorrection, lines: dict[str, tuple[float, float]]) -> go.Figure:
+    """The bias taken off a flight's inertial data with its 95 % band, and how far its temperatures left the chamber's."""
+    figure = make_subplots(rows=3, cols=1, shared_xaxes=True, vertical_spacing=0.05)
+    parts = ((taken.gyro, taken.sigma_gyro, 1.0 / DEG_PER_H), (taken.accel, taken.sigma_accel, 1.0 / MICRO_G))
+    for row, (bias, sigma, scale) in enumerate(parts, start=1):
+        for axis in range(3):
+            time, middle = thin(taken.time, scale * bias[:, axis])
+            _, low = thin(taken.time, scale * (bias - 1.96 * sigma)[:, axis])
+            _, high = thin(taken.time, scale * (bias + 1.96 * sigma)[:, axis])
+            figure.add_scatter(
+                x=[*time, *time[::-1]],
+                y=[*high, *low[::-1]],
+                fill="toself",
+                mode="none",
+                fillcolor=PALETTE[axis],
+                opacity=0.2,
+                name="95 %",
+                showlegend=False,
+                row=row,
+                col=1,
+            )
+            line = {"color": PALETTE[axis], "width": 1.4}
+            name = AXES[axis]
+            figure.add_scatter(
+                x=time, y=middle, name=name, legendgroup=name, showlegend=row == 1, line=line, row=row, col=1
+            )
+    time, farthest = thin(taken.time, taken.distance.max(axis=1))
+    line = {"color": COLOURS["nominal"], "width": 1.4}
+    figure.add_scatter(x=time, y=farthest, name="farthest channel", showlegend=False, line=line, row=3, col=1)
+    for row, title in enumerate(("gyro [°/h]", "accel [µg]", "outside chamber [σ]"), start=1):
+        figure.update_yaxes(title=title, row=row, col=1)
+    figure.update_yaxes(rangemode="tozero", row=3, col=1)
+    _shade(figure, lines)
+    figure.update_xaxes(title="time [s after the epoch]", exponentformat="none", separatethousands=False, row=3, col=1)
+    return layout(figure, 620)
 
 
 def tracks_over_frame(frames: Frames, tracks: Tracks) -> go.Figure:

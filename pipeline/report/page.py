@@ -16,7 +16,7 @@ from plotly.offline import get_plotlyjs
 
 from pipeline.campaign import Campaign
 from pipeline.datasets import open_dataset
-from pipeline.records import Interferograms, Spectra, Tracks, Trajectory
+from pipeline.records import Interferograms, Spectra, ThermalCorrection, Tracks, Trajectory
 from pipeline.report import figures
 
 
@@ -106,6 +106,9 @@ def _flight(campaign: Campaign, out: Path, flight: str, run: dict[str, Any], dra
             "separation": draw.html(figures.separation(quality, spans)),
             "sensor_errors": draw.html(figures.sensor_errors(quality, spans)),
         }
+        if (out / flight / "thermal.nc").exists() and (entry["navigation"] or {}).get("compensated"):
+            taken = ThermalCorrection.from_file(out / flight / "thermal.nc")
+            entry["figures"]["correction"] = draw.html(figures.correction(taken, spans))
     for line in lines:
         entry["lines"].append(_line(campaign, out, flight, line, run["flights"][flight]["lines"][line], draw))
     return entry

@@ -683,3 +683,54 @@ def test_a_bench_interferogram_alone_is_a_campaign(tmp_path: Path, tsmftis: Any)
     spectrum = next(v for v in found.data_vars.values() if v.dims == ("wavenumber",))
     peak = float(found.wavenumber.values[int(np.argmax(spectrum.values))])
     assert peak == pytest.approx(centre, abs=1e3)
+
+
+# --- thermal compensation and truth -----------------------------------------------------------------------------------
+
+
+def test_a_flight_beyond_the_chamber_and_a_dead_thermometer_are_told(copied: Path, again: Path, tsmftis: Any) -> None:
+    """40 K hotter than any chamber run, and gyro x without a thermometer that moves: both on the console and in run.json."""
+    path = copied / "F1" / "imu.nc"
+    with xr.open_dataset(path) as d:
+        dataset = d.load()
+    for name in ("temperature_gyro", "temperature_accel"):
+        ramp = np.linspace(55.0, 60.0, dataset[name].shape[0]).reshape(-1, *[1] * (dataset[name].ndim - 1))
+        dataset[name].values[:] += ramp
+    dataset["temperature_gyro"].values[:, 0, :] = 85.0
+    path.unlink()
+    dataset.to_netcdf(path, engine="h5netcdf")
+    answer = tsmftis("run", copied, "--out", again)
+    assert answer.code == 0, answer.err
+    assert "gyro x" in answer.out and "beyond what the chamber runs" in answer.out
+    navigation = json.loads((again / "run.json").read_text())["flights"]["F1"]["navigation"]
+    assert navigation["uncompensated"] == ["gyro x"] and navigation["chamber_distance_max"] > 0.5
+
+
+def test_the_method_that_compensates_is_a_choice(demo: Path, again: Path) -> None:
+    """`none` takes nothing off; `polynomial` takes off what the model file's polynomial says."""
+    ran(demo, again, "thermal.method=none")
+    navigation = json.loads((again / "F1" / "navigation.json").read_text())["quality"]
+    assert "chamber_distance_max" not in navigation
+    assert "navigation@F1" in ran(demo, again, "thermal.method=polynomial")
+    from stages.thermal import ThermalModel
+
+    channel = ThermalModel.from_file(again / "thermal_model.nc").channels[0]
+    coefficients = channel.predictors["polynomial"].coefficients  # type: ignore[attr-defined]
+    taken, imu = read(again / "F1" / "thermal.nc"), read(demo / "F1" / "imu.nc")
+    warm = (float(imu["temperature_gyro"].values[:, 0].mean()) - channel.mean[0]) / channel.scale[0]
+    assert np.allclose(
+        taken["gyro"].values[:, 0].mean(), np.polynomial.polynomial.polyval(warm, coefficients), rtol=0.02
+    )
+
+
+def test_true_poses_are_a_method_and_no_worse_than_tracking(demo: Path, again: Path, tsmftis: Any) -> None:
+    """Tracks by the simulator's own poses lie within 4 sigmas of the POS's; a folder without such files is refused."""
+    truth = demo.with_name(demo.name + "-truth")
+    answer = tsmftis("run", demo, "--out", again, "--truth", truth)
+    assert answer.code == 0, answer.err
+    with xr.open_dataset(again / "F1" / "L01" / "tracks.nc") as d:
+        away = np.hypot(*(d[n].sel({"method": "true"}) - d[n].sel({"method": "tracking"}) for n in ("row", "col")))
+        assert 0.0 < float(away.max()) < 0.5
+    assert answer.out.count("true ") >= 1
+    wrong = tsmftis("run", demo, "--out", again, "--truth", demo)
+    assert wrong.code == 2 and "--truth" in wrong.err and "Traceback" not in wrong.err
