@@ -17,7 +17,13 @@ from tsmftis.inertial import DEG_PER_H, MICRO_G
 
 Array = NDArray[np.float64]
 
-COLOURS = {"nominal": "#8c8c8c", "true": "#2a9d3a", "registration": "#e07b00", "tracking": "#0b63b0", "reference": "#111111"}
+COLOURS = {
+    "nominal": "#8c8c8c",
+    "true": "#2a9d3a",
+    "registration": "#e07b00",
+    "tracking": "#0b63b0",
+    "reference": "#111111",
+}
 SENSOR = {"raw": "#8c8c8c", "polynomial": "#b07aa1", "rbf": "#e07b00", "bayesian_rbf": "#0b63b0"}
 AXES = ("x", "y", "z")
 NED = ("north", "east", "down")
