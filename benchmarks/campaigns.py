@@ -21,6 +21,7 @@ import numpy as np
 import xarray as xr
 import yaml
 
+from pipeline.records import LADDER
 from tsmftis.inertial import DEG_PER_H, MICRO_G
 from tsmftis.rotation import rpy_to_dcm
 
@@ -96,14 +97,23 @@ def main() -> None:
         truth = campaign.with_name(campaign.name + "-truth")
         with tempfile.TemporaryDirectory() as folder:
             out = Path(folder)
-            seconds, memory = timed(
-                [str(Path(sys.executable).with_name("tsmftis")), "run", str(campaign), "--out", folder]
-            )
+            command = [str(Path(sys.executable).with_name("tsmftis")), "run", str(campaign), "--out", folder]
+            if any(truth.glob("L*.npz")):
+                command += ["--truth", str(truth)]
+            seconds, memory = timed(command)
             run = json.loads((out / "run.json").read_text())
             print(f"\n{campaign.name}: {seconds:.0f} s from nothing, peak memory {memory:.2f} GB")
             for kind in ("rqe", "rqe_area"):
-                if run[kind]:
-                    print(f"  {kind}: " + ", ".join(f"{m} {v:.4f}" for m, v in run[kind].items()))
+                for said, scores in (
+                    (kind, run[kind]),
+                    (f"{kind} by noise alone", run["noise_limit"][kind]),
+                    (
+                        f"{kind} of {len(run['high_gradient']['targets'])} high-gradient targets",
+                        run["high_gradient"][kind],
+                    ),
+                ):
+                    if scores:
+                        print(f"  {said}: " + ", ".join(f"{m} {scores[m]:.4f}" for m in LADDER if m in scores))
             if (truth / "yardstick.json").exists():
                 yard = json.loads((truth / "yardstick.json").read_text())
                 means = ", ".join(f"{kind} {yard[kind]['mean']:.4f}" for kind in ("rqe", "rqe_area"))

@@ -1,18 +1,23 @@
 """The thermal compensation measured on many simulated instruments that run through the paper's two chamber profiles.
 
     python benchmarks/thermal.py [COUNT] [PRESET]   residuals over the noise floor, coverage, seconds, by method (20, survey)
+    python benchmarks/thermal.py runs CAMPAIGN ...  one chamber run, and the same cut into two that differ (truth beside it)
 
 An instrument is drawn from a seed: thermometers' nodes, laws of the biases, scale factors. It is trained on the first profile and
 judged on the second, and on a third that goes 20 °C beyond the first. The floor of a channel is the standard deviation of 100 s
-means of its noise alone. Gaussian process and BayesianRidge are scikit-learn's on the same blocks and features.
+means of its noise alone. Gaussian process and BayesianRidge are scikit-learn's on the same blocks and features. Seconds are those
+of one instrument by itself, after the others.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +28,9 @@ from pipeline.records import Chamber, Temperatures
 from stages import thermal
 from stages.simulation import SimulationSettings, sensors
 from stages.simulation.settings import AirProfile
-from stages.thermal.targets import bias_samples, block_means
+from stages.thermal.binning import block_means
+from stages.thermal.targets import bias_samples
+from tsmftis.inertial import DEG_PER_H, MICRO_G
 from tsmftis.simulator import effects
 from tsmftis.simulator.streams import stream
 
@@ -31,6 +38,7 @@ Array = NDArray[np.float64]
 
 WORKERS = 2
 BLOCK = 100.0
+UNITS = np.repeat([1.0 / DEG_PER_H, 1.0 / MICRO_G], 3)
 BASELINES = ("polynomial", "multi_polynomial", "rbf", "gaussian_process", "bayesian_ridge")
 # 20 °C beyond the training profile's −30 and 50 °C, both ways.
 BEYOND = AirProfile.model_validate(
@@ -59,34 +67,90 @@ def instrument(seed: int, settings: SimulationSettings) -> dict[str, tuple[Chamb
 
 
 def judge(seed: int, preset: str) -> dict[str, Any]:
-    """By method and channel on `verify` and `beyond`: residual [°/h, µg] and its floor; coverage of 95 % intervals; seconds."""
+    """By method and channel on `verify` and `beyond`: residual [°/h, µg] and its floor; coverage of 95 % intervals."""
     settings = SimulationSettings.preset(preset)
     runs = instrument(seed, settings)
-    seconds = {}
-    for name, baselines in (("network", ()), ("with the Gaussian process", ("gaussian_process",)), ("all", BASELINES)):
-        chosen = thermal.ThermalSettings(baselines=baselines)
-        started = time.perf_counter()
-        model = thermal.run([runs["train"][0]], [], chosen).model
-        seconds[name] = time.perf_counter() - started
-    flight = np.linspace(0.0, 12000.0, 12001)
-    warm = 20.0 + 10.0 * np.sin(flight / 2000.0)
-    started = time.perf_counter()
-    model.correction(Temperatures(flight, np.tile(warm[:, None, None], (1, 3, 3)), np.tile(warm[:, None], (1, 3))))
-    seconds["apply"] = time.perf_counter() - started
-    out: dict[str, Any] = {"seconds": seconds}
+    model = thermal.run([runs["train"][0]], [], thermal.ThermalSettings(baselines=BASELINES)).model
+    out: dict[str, Any] = {}
     for name in ("verify", "beyond"):
         run, true = runs[name]
         shown = thermal.verify_run(model, run, BLOCK)
-        scale = np.repeat([1.0 / thermal.DEG_PER_H, 1.0 / thermal.MICRO_G], 3)
         left = {"raw": shown["raw"], **shown["left"]}
         covered = (np.abs(left["bayesian_rbf"]) < 1.96 * shown["sigma"]).mean(axis=0)
         floor = block_means(run.time, bias_samples(run) - true, BLOCK).std(axis=0)
         out[name] = {
-            "left": {method: values.std(axis=0) * scale for method, values in left.items()},
-            "floor": floor * scale,
+            "left": {method: values.std(axis=0) * UNITS for method, values in left.items()},
+            "floor": floor * UNITS,
             "covered": covered,
         }
     return out
+
+
+def seconds(preset: str) -> dict[str, float]:
+    """Median seconds of three fits of six channels, and of applying the model to 3 h 20 min, with nothing else running here."""
+    train = instrument(0, SimulationSettings.preset(preset))["train"][0]
+    flight = np.linspace(0.0, 12000.0, 12001)
+    warm = 20.0 + 10.0 * np.sin(flight / 2000.0)
+    readings = Temperatures(flight, np.tile(warm[:, None, None], (1, 3, 3)), np.tile(warm[:, None], (1, 3)))
+
+    def fit(*baselines: str) -> thermal.ThermalModel:
+        return thermal.run([train], [], thermal.ThermalSettings.model_validate({"baselines": baselines})).model
+
+    model = fit()
+    work: dict[str, Callable[[], Any]] = {
+        "network": fit,
+        "with the Gaussian process": lambda: fit("gaussian_process"),
+        "apply": lambda: model.correction(readings),
+    }
+    found = {}
+    for name, call in work.items():
+        taken = []
+        for _ in range(3):
+            started = time.perf_counter()
+            call()
+            taken.append(time.perf_counter() - started)
+        found[name] = float(np.median(taken))
+    return found
+
+
+def cut_runs(campaign: Path) -> None:
+    """What the verification run keeps over its noise floor after training on one run, and on it cut into two that differ."""
+    truth = campaign.with_name(campaign.name + "-truth") / "thermal.npz"
+    train, verify = (Chamber.from_file(campaign / "chamber" / f"{n}.nc", n) for n in ("train", "verify"))
+    with np.load(truth) as known:
+        noise = np.hstack([verify.gyro - known["verify_gyro"], verify.accel - known["verify_accel"]])
+    floor = block_means(verify.time, noise, BLOCK).std(axis=0)
+    half = len(train.time) // 2
+    step = np.array([0.05, -0.05, 0.025, 50.0, -50.0, 50.0]) / UNITS
+
+    def part(of: slice, attitude: bool, off: float) -> Chamber:
+        t = train.temperatures
+        return replace(
+            train,
+            time=train.time[of],
+            gyro=train.gyro[of] + off * step[:3],
+            accel=train.accel[of] + off * step[3:],
+            temperatures=Temperatures(t.time[of], t.gyro[of], t.accel[of]),
+            attitude=train.attitude if attitude else None,
+            temperature_chamber=None,
+        )
+
+    halves = (slice(0, half), slice(half, None))
+    cases = {
+        "one run": [train],
+        "two halves": [part(of, True, 0.0) for of in halves],
+        "the second off by 0.05 °/h, 50 µg": [part(of, True, float(i)) for i, of in enumerate(halves)],
+        "two halves without attitude": [part(of, False, 0.0) for of in halves],
+    }
+    print(
+        f"{campaign.name}: gyro x, y, z, accelerometer x, y, z over the floor; 95 % intervals about the run's mean hold"
+    )
+    for name, runs in cases.items():
+        shown = thermal.run(runs, [verify], thermal.ThermalSettings(baselines=())).figures["verify"][0]
+        left = shown["left"]["bayesian_rbf"]
+        held = (np.abs(left - left.mean(axis=0)) < 1.96 * shown["sigma"]).mean()
+        ratios = " ".join(f"{r:.2f}" for r in left.std(axis=0) / floor)
+        print(f"  {name:<36}{ratios}  {held:.3f}")
 
 
 def instruments(count: int, preset: str) -> None:
@@ -124,11 +188,15 @@ def instruments(count: int, preset: str) -> None:
         print(
             f"  95 % intervals hold on {name}: gyros {covered[:, :3].mean():.3f}, accelerometers {covered[:, 3:].mean():.3f}"
         )
-    for name in found[0]["seconds"]:
-        print(f"  seconds, {name}: {np.median([f['seconds'][name] for f in found]):.2f} (two instruments at a time)")
+    for name, value in seconds(preset).items():
+        print(f"  seconds by itself, {name}: {value:.2f}")
 
 
 def main() -> None:
+    if sys.argv[1:2] == ["runs"]:
+        for campaign in map(Path, sys.argv[2:]):
+            cut_runs(campaign)
+        return
     count, preset = (sys.argv[1:] + ["20", "survey"][len(sys.argv) - 1 :])[:2]
     instruments(int(count), preset)
 

@@ -23,6 +23,7 @@ from scipy.interpolate import CubicSpline
 
 from pipeline.campaign import read_campaign
 from pipeline.records import Imu
+from stages.thermal.binning import block_means
 from tsmftis.geodesy import geodetic_to_ecef, ned_to_ecef_dcm, normal_gravity
 from tsmftis.inertial import DEG_PER_H, MICRO_G
 from tsmftis.rotation import log_so3, rpy_to_dcm
@@ -53,9 +54,8 @@ def true_readings(truth: Path, imu_to_body: Array, time: Array) -> Array:
 
 
 def windows(time: Array, values: Array) -> Array:
-    index = ((time - time[0]) // WINDOW).astype(int)
-    full = np.bincount(index) >= 0.9 * np.bincount(index).max()
-    return np.stack([np.bincount(index, v)[full] / np.bincount(index)[full] for v in values.T], -1)
+    """Means over 20 s (b, 6)."""
+    return block_means(time, values, WINDOW)
 
 
 def pixels(run: Path, detector: tuple[int, int]) -> Array:

@@ -43,10 +43,14 @@ def assemble(plan: Plan, records: list[StageRecord]) -> dict[str, Any]:
             unit = f"{flight.id}/{line.id}"
             if not any(unit in s for s in stages.values()):
                 continue
-            score = summary("scoring", unit) or {"scores": {"rqe": {}, "rqe_area": {}}, "partly_seen": {}}
+            empty: dict[str, Any] = {k: {"rqe": {}, "rqe_area": {}} for k in ("scores", "noise_limit")}
+            # A line that this run did not touch may have been scored by an earlier version, which said less.
+            score = {**empty, "partly_seen": {}, "high_gradient": []} | (summary("scoring", unit) or {})
             lines[line.id] = {
                 "rqe": score["scores"]["rqe"],
                 "rqe_area": score["scores"]["rqe_area"],
+                "noise_limit": score["noise_limit"],
+                "high_gradient": score["high_gradient"],
                 **{
                     s: summary(s, unit)
                     for s in ("tracking", "registration", "reconstruction", "mapping")
@@ -65,6 +69,13 @@ def assemble(plan: Plan, records: list[StageRecord]) -> dict[str, Any]:
         },
         "campaign": keys.name,
         **means,
+        "noise_limit": campaign_means(_noise(line) for line in lines_of(flights)),
+        "high_gradient": {
+            "targets": [
+                f"{f}/{i}/{t}" for f, e in flights.items() for i, n in e["lines"].items() for t in n["high_gradient"]
+            ],
+            **campaign_means(_steep(line) for line in lines_of(flights)),
+        },
         "partly_seen": partly,
         "flights": flights,
         "bench": {b.id: s for b in keys.bench if (s := summary("bench", b.id)) is not None},
@@ -74,6 +85,22 @@ def assemble(plan: Plan, records: list[StageRecord]) -> dict[str, Any]:
     if keys.thermal and (verification := summary("thermal", "campaign")) is not None:
         content["thermal"] = verification
     return content
+
+
+def _noise(line: Mapping[str, Any]) -> dict[str, Any]:
+    """A line's limits by noise in the form of its scores."""
+    return {kind: {m: {"targets": v} for m, v in methods.items()} for kind, methods in line["noise_limit"].items()}
+
+
+def _steep(line: Mapping[str, Any]) -> dict[str, Any]:
+    """A line's scores of the targets with high gradients alone."""
+    return {
+        kind: {
+            m: {"targets": {t: v for t, v in entry["targets"].items() if t in line["high_gradient"]}}
+            for m, entry in line[kind].items()
+        }
+        for kind in SCORES
+    }
 
 
 def lines_of(flights: Mapping[str, Any]) -> list[dict[str, Any]]:

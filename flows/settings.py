@@ -12,6 +12,7 @@ from pipeline.campaign import validate
 from pipeline.errors import InputError
 from pipeline.yaml_file import load_yaml
 from stages.bench import BenchSettings
+from stages.budget import BudgetSettings
 from stages.mapping import MappingSettings
 from stages.navigation import NavigationSettings
 from stages.reconstruction import ReconstructionSettings
@@ -32,6 +33,7 @@ class Settings(BaseModel):
     reconstruction: ReconstructionSettings = ReconstructionSettings()
     mapping: MappingSettings = MappingSettings()
     bench: BenchSettings = BenchSettings()
+    budget: BudgetSettings = BudgetSettings()
 
 
 def load_settings(file: Path | None, assignments: list[str]) -> Settings:

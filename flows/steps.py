@@ -15,28 +15,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rasterio.transform import Affine
-from rasterio.windows import Window
 
 from flows.settings import Settings
 from pipeline.campaign import Campaign, read_campaign
-from pipeline.datasets import write_dataset
+from pipeline.datasets import open_dataset, write_dataset
 from pipeline.errors import InputError
 from pipeline.formats import sbet, smrmsg
 from pipeline.formats.table import write_csv
 from pipeline.model_update import Effects
-from pipeline.raster import Dem, Quicklook, open_cube
-from pipeline.records import CameraPoses, Imu, Spectra, ThermalCorrection, Tracks, Trajectory
+from pipeline.raster import CubeGrid, Dem, write_cube
+from pipeline.records import CameraPoses, Spectra, Tracks, Trajectory
 from pipeline.run_stage import StageRecord, run_stage, write_json
 from pipeline.truth import read_true_poses, true_poses_file
 from stages import bench as bench_stage
 from stages import mapping, navigation, reconstruction, registration, scoring, thermal, tracking
 from tsmftis import __version__
 from tsmftis.effects import EFFECTS
-from tsmftis.fourier import smooth_phase
+from tsmftis.fourier import SCORED_APODIZATION, line_width, rqe, smooth_phase
 
-FAR_FROM_CHAMBER = 0.5  # standard deviations of a feature
-UPDATED = frozenset({"navigation"})  # stages whose models take a model update
+UPDATED = frozenset({"navigation", "geometry", "spectral"})  # stages whose models take a model update
 
 # Each stage and the stages whose results it reads, in the order in which a reader should meet them.
 NEEDS: Mapping[str, tuple[str, ...]] = {
@@ -77,9 +74,9 @@ class Plan:
     def opened(self) -> Campaign:
         return read_campaign(self.campaign)
 
-    def effects(self, stage: str) -> Effects:
-        """The update's effects on a stage's model."""
-        return {name: values for name, values in self.update.items() if EFFECTS[name].stage == stage}
+    def effects(self, *stages: str) -> Effects:
+        """The update's effects on the models of these stages, as `tsmftis.effects` names them."""
+        return {name: values for name, values in self.update.items() if EFFECTS[name].stage in stages}
 
     def wants(self, flight: str, line: str) -> bool:
         return not self.lines or line in self.lines or f"{flight}/{line}" in self.lines
@@ -113,11 +110,12 @@ def thermal_step(plan: Plan) -> StageRecord:
     keys = campaign.keys.thermal
     assert keys is not None
     names = [*keys.train, *keys.verify]
+    unit = campaign.instrument.imu
+    turn_on = None if unit is None else (unit.gyro.bias_sigma, unit.accel.bias_sigma)
 
     def work(to: Paths) -> dict[str, Any]:
-        result = thermal.run(
-            [campaign.chamber(n) for n in keys.train], [campaign.chamber(n) for n in keys.verify], plan.settings.thermal
-        )
+        train, verify = ([campaign.chamber(n) for n in part] for part in (keys.train, keys.verify))
+        result = thermal.run(train, verify, plan.settings.thermal, turn_on)
         write_dataset(result.model.to_dataset(), to["model"])
         write_json(to["figures"], _plain(result.figures))
         return {"verify": result.verification, "notes": list(result.notes)}
@@ -127,7 +125,12 @@ def thermal_step(plan: Plan) -> StageRecord:
         "thermal",
         "campaign",
         ("stages.thermal",),
-        {"settings": _plain(plan.settings.thermal), "train": list(keys.train), "verify": list(keys.verify)},
+        {
+            "settings": _plain(plan.settings.thermal),
+            "train": list(keys.train),
+            "verify": list(keys.verify),
+            "turn_on": _plain(turn_on),
+        },
         {n: campaign.path(n) for n in names},
         {"model": "thermal_model.nc", "figures": "thermal_figures.json"},
         work,
@@ -157,14 +160,17 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
     if update := plan.effects("navigation"):
         about["model_update"] = json.dumps(update, sort_keys=True)
     method = plan.settings.thermal.method
-    declared = campaign.keys.thermal is not None and _has_temperatures(campaign, flight)
+    declared = campaign.keys.thermal is not None and _can_be_compensated(campaign, flight)
     if compensated := declared and method != "none":
         inputs["model"] = _needed(model, "thermal")
         outputs["correction"] = f"{flight}/thermal.nc"
 
     def work(to: Paths) -> dict[str, Any]:
         imu = campaign.imu(flight)
-        correction = _correction(model, imu, method) if compensated else None
+        known = thermal.ThermalModel.from_file(model) if compensated else None
+        correction = None
+        if known is not None and imu.temperatures is not None:
+            correction = known.correction(imu.temperatures, method, of=imu.time, where=inputs["imu"])
         assert instrument.imu is not None and instrument.mounting is not None
         with _naming(gnss=inputs["gnss"], imu=inputs["imu"], **{"campaign.yaml": campaign.root / "campaign.yaml"}):
             result = navigation.run(
@@ -183,11 +189,11 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         sbet.write_sbet(sbet.from_trajectory(result.trajectory), to["sbet"])
         smrmsg.write_smrmsg(smrmsg.from_trajectory(result.trajectory), to["smrmsg"])
         write_json(to["figures"], {"quality": result.quality, "figures": result.figures})
-        if correction is None:
-            return result.quality | {"compensated": False}
-        reach = _reach(correction)
-        warnings = [*result.quality["warnings"], *_beyond(reach)]
-        return result.quality | {"compensated": True, "warnings": warnings} | reach
+        if known is None or correction is None:
+            told = [] if imu.compensated_by is None else [f"compensated already, by {imu.compensated_by}: not again"]
+            return result.quality | {"compensated": False, "warnings": [*result.quality["warnings"], *told]}
+        warnings = [*result.quality["warnings"], *known.doubts, *correction.warnings]
+        return result.quality | {"compensated": True, "warnings": warnings} | correction.reach
 
     return run_stage(
         plan.out,
@@ -216,18 +222,21 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
     campaign = plan.opened
     entry, instrument = campaign.line(flight, line), campaign.instrument
     trajectory = plan.out / flight / "trajectory.nc"
+    effects = plan.effects("geometry")
     inputs = {
         "trajectory": _needed(trajectory, "navigation"),
         "frames": campaign.path(entry.frames),
         "targets": campaign.path(entry.targets),
     }
+    if drifts := "boresight_thermal_drift" in effects:
+        inputs["imu"] = campaign.path(campaign.flight(flight).imu)
     if plan.truth is not None and (path := true_poses_file(plan.truth, line)) is not None:
         inputs["truth"] = path
 
     def work(to: Paths) -> dict[str, Any]:
         assert instrument.camera is not None and instrument.mounting is not None
         stamps = campaign.frames(flight, line).time
-        with _naming(frames=inputs["frames"], targets=inputs["targets"]):
+        with _naming(**{n: inputs[n] for n in ("frames", "targets", "imu") if n in inputs}):
             result = tracking.run(
                 Trajectory.from_file(trajectory),
                 stamps,
@@ -236,6 +245,8 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
                 instrument.mounting,
                 plan.settings.tracking,
                 read_true_poses(inputs["truth"], stamps.size) if "truth" in inputs else None,
+                campaign.imu(flight).temperatures if drifts else None,
+                effects,
             )
         write_dataset(result.tracks.to_dataset(), to["tracks"])
         write_dataset(result.poses.to_dataset(), to["poses"])
@@ -253,6 +264,7 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
         ("stages.tracking", "pipeline.formats.table"),
         {
             "settings": _plain(plan.settings.tracking),
+            "effects": effects,
             "camera": _plain(instrument.camera),
             "mounting": _plain(instrument.mounting),
         },
@@ -268,20 +280,27 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
 
 
 def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
-    """Frames and the POS tracks' anchors → tracks.nc with all methods."""
+    """Frames, camera poses and the POS tracks' anchors → tracks.nc with all methods."""
     campaign = plan.opened
-    source = plan.out / flight / line / "pos_tracks.nc"
+    folder = plan.out / flight / line
     camera = campaign.instrument.camera
     assert camera is not None
+    inputs = {
+        "tracks": _needed(folder / "pos_tracks.nc", "tracking"),
+        "poses": _needed(folder / "poses.nc", "tracking"),
+        "frames": campaign.path(campaign.line(flight, line).frames),
+    }
 
     def work(to: Paths) -> dict[str, Any]:
-        tracks = Tracks.from_file(source)
-        by_pos = tracks.methods.index("tracking")
+        tracks = Tracks.from_file(inputs["tracks"])
         followed = registration.run(
             campaign.frames(flight, line),
-            Tracks(("tracking",), tracks.targets, tracks.row[[by_pos]], tracks.col[[by_pos]]),
+            tracks.only("tracking"),
+            tracks.only("nominal"),
+            CameraPoses.from_file(inputs["poses"]),
             camera,
             plan.settings.registration,
+            plan.effects("geometry"),
         )
         write_dataset(tracks.joined(followed).to_dataset(), to["tracks"])
         return dict(followed.notes)
@@ -291,8 +310,12 @@ def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
         "registration",
         f"{flight}/{line}",
         ("stages.registration",),
-        {"settings": _plain(plan.settings.registration), "camera": _plain(camera)},
-        {"tracks": _needed(source, "tracking"), "frames": campaign.path(campaign.line(flight, line).frames)},
+        {
+            "settings": _plain(plan.settings.registration),
+            "effects": plan.effects("geometry"),
+            "camera": _plain(camera),
+        },
+        inputs,
         {"tracks": f"{flight}/{line}/tracks.nc"},
         work,
         **plan.switches("registration"),
@@ -300,7 +323,7 @@ def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
 
 
 def reconstruction_step(plan: Plan, flight: str, line: str) -> StageRecord:
-    """Frames and tracks → spectra.nc as scored, interferograms.nc."""
+    """Frames and tracks → spectra.nc as scored, products.nc, interferograms.nc."""
     campaign = plan.opened
     entry, instrument = campaign.line(flight, line), campaign.instrument
     folder = plan.out / flight / line
@@ -324,15 +347,32 @@ def reconstruction_step(plan: Plan, flight: str, line: str) -> StageRecord:
             instrument.camera,
             instrument.interferometer,
             plan.settings.reconstruction,
+            plan.effects("spectral"),
         )
         write_dataset(result.spectra.to_dataset(), to["spectra"])
-        columns = np.arange(instrument.interferometer.cols)
-        opd = instrument.interferometer.opd((instrument.interferometer.rows - 1) / 2, columns)
+        write_dataset(result.products.to_dataset(), to["products"])
+        updated = instrument.interferometer.with_effects(plan.effects("spectral"))
+        opd = updated.opd((updated.rows - 1) / 2, np.arange(updated.cols))
         interferograms = result.interferograms.to_dataset().assign_coords(
             opd=(("col",), opd, {"units": "m", "long_name": "optical path difference in the middle row"})
         )
         write_dataset(interferograms, to["interferograms"])
-        return {"phase": result.phase.tolist(), "read_variance_dn2": result.read_variance, "gain_dn": result.gain}
+        return {
+            "phase": result.phase.tolist(),
+            "read_variance_dn2": result.read_variance,
+            "gain_dn": result.gain,
+            "bad_pixels": result.bad_pixels,
+            "blur_px": result.products.attributes["blur_px"],
+            **{
+                name: {
+                    t: None if np.isnan(v) else float(v) for t, v in zip(result.products.targets, values, strict=True)
+                }
+                for name, values in (
+                    ("imaginary_residue", result.products.imaginary),
+                    ("panel_rqe", rqe(result.products.panel, result.products.reference)),
+                )
+            },
+        }
 
     return run_stage(
         plan.out,
@@ -341,22 +381,23 @@ def reconstruction_step(plan: Plan, flight: str, line: str) -> StageRecord:
         ("stages.reconstruction",),
         {
             "settings": _plain(plan.settings.reconstruction),
+            "effects": plan.effects("spectral"),
             "camera": _plain(instrument.camera),
             "interferometer": _plain(instrument.interferometer),
         },
         inputs,
-        {"spectra": f"{flight}/{line}/spectra.nc", "interferograms": f"{flight}/{line}/interferograms.nc"},
+        {n: f"{flight}/{line}/{n}.nc" for n in ("spectra", "products", "interferograms")},
         work,
         **plan.switches("reconstruction"),
     )
 
 
 def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
-    """Frames, poses, terrain and the line's phase → cube.tif and quicklook.png."""
+    """Frames, poses, terrain and the line's phase → cube.tif, location.tif, quicklook.png (and cube.img with cube.hdr)."""
     campaign = plan.opened
     entry, instrument = campaign.line(flight, line), campaign.instrument
     folder = plan.out / flight / line
-    settings = plan.settings.mapping
+    settings, effects = plan.settings.mapping, plan.effects("geometry", "spectral")
     inputs = {
         "poses": _needed(folder / "poses.nc", "tracking"),
         "spectra": _needed(folder / "spectra.nc", "reconstruction"),
@@ -366,40 +407,47 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
     }
     if campaign.keys.dem is not None:
         inputs["dem"] = campaign.path(campaign.keys.dem)
+    files = {"cube": "cube.tif", "quicklook": "quicklook.png", "location": "location.tif"}
+    if settings.envi:
+        files |= {"envi": "cube.img", "envi_header": "cube.hdr"}
 
     def work(to: Paths) -> dict[str, Any]:
         camera, interferometer = instrument.camera, instrument.interferometer
         assert camera is not None and interferometer is not None
         targets, poses = campaign.targets(flight, line), CameraPoses.from_file(folder / "poses.nc")
         dem = None if campaign.keys.dem is None else Dem.from_file(inputs["dem"])
-        heights, ground = mapping.surface(targets, dem)
-        grid = mapping.line_grid(poses, camera, ground, settings)
+        heights, ground = mapping.surface(targets, dem, effects)
+        grid = mapping.line_grid(poses, camera, ground, settings, effects)
         spectra = Spectra.from_file(folder / "spectra.nc")
         wavenumber = interferometer.scored_wavenumbers(settings.wavenumber_step_per_m)
         phase = smooth_phase(spectra.phase, wavenumber, (spectra.wavenumber[0], spectra.wavenumber[-1]))
-        quicklook = Quicklook(grid.shape, wavenumber)
-        with open_cube(to["cube"], grid.crs, Affine(*grid.affine), grid.shape, 1e9 / wavenumber) as cube:
-            for start, strip in mapping.run(
-                campaign.frames(flight, line),
-                poses,
-                heights,
-                grid,
-                wavenumber,
-                phase,
-                campaign.calibration(),
-                camera,
-                interferometer,
-                int(spectra.attributes["drift_order"]),
-            ):
-                cube.write(np.moveaxis(strip, 2, 0), window=Window(0, start, strip.shape[1], strip.shape[0]))
-                quicklook.add(start, strip)
-        quicklook.write(to["quicklook"])
+        strips = mapping.run(
+            campaign.frames(flight, line),
+            poses,
+            heights,
+            grid,
+            wavenumber,
+            phase,
+            campaign.calibration(),
+            camera,
+            interferometer,
+            int(spectra.attributes["drift_order"]),
+            effects,
+        )
+        width = line_width(SCORED_APODIZATION, interferometer.with_effects(effects).longest_opd)
+        seen = write_cube(
+            CubeGrid(grid.crs, grid.affine, grid.shape, wavenumber, width),
+            strips,
+            lambda start, stop: grid.places(start, stop, heights),
+            to,
+        )
         return {
             "cells": list(grid.shape),
             "cell_m": grid.cell,
             "crs": grid.crs,
             "bands": wavenumber.size,
-            "seen_fraction": quicklook.seen_fraction,
+            "seen_fraction": seen,
+            "warnings": _beyond_terrain(mapping.share_outside(grid, dem) if dem is not None else 0.0),
             "terrain": "dem" if dem is not None else f"flat at {ground:.1f} m",
         }
 
@@ -410,23 +458,34 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
         ("stages.mapping", "pipeline.raster"),
         {
             "settings": _plain(settings),
+            "effects": effects,
             "camera": _plain(instrument.camera),
             "interferometer": _plain(instrument.interferometer),
         },
         inputs,
-        {"cube": f"{flight}/{line}/cube.tif", "quicklook": f"{flight}/{line}/quicklook.png"},
+        {n: f"{flight}/{line}/{file}" for n, file in files.items()},
         work,
         **plan.switches("mapping"),
     )
 
 
+def _beyond_terrain(share: float) -> list[str]:
+    if share == 0.0:
+        return []
+    return [
+        f"{share:.0%} of the map lie beyond the edge of the terrain model, whose last height is held on there: these cells may "
+        "be displaced, and their spectra mixed"
+    ]
+
+
 def scoring_step(plan: Plan, flight: str, line: str) -> StageRecord:
-    """spectra.nc → scores.json."""
-    spectra = plan.out / flight / line / "spectra.nc"
+    """spectra.nc, and from products.nc how much the targets' surroundings differ → scores.json."""
+    spectra, products = (plan.out / flight / line / f"{n}.nc" for n in ("spectra", "products"))
 
     def work(to: Paths) -> dict[str, Any]:
-        result = scoring.run(Spectra.from_file(spectra))
-        content = {"scores": result.scores, "partly_seen": result.partly_seen}
+        with open_dataset(products) as d:
+            contrast = dict(zip(map(str, d["target"].values), d["contrast"].values.tolist(), strict=True))
+        content: dict[str, Any] = _plain(scoring.run(Spectra.from_file(spectra), contrast))
         write_json(to["scores"], content)
         return content
 
@@ -436,7 +495,7 @@ def scoring_step(plan: Plan, flight: str, line: str) -> StageRecord:
         f"{flight}/{line}",
         ("stages.scoring",),
         {},
-        {"spectra": _needed(spectra, "reconstruction")},
+        {"spectra": _needed(spectra, "reconstruction"), "products": _needed(products, "reconstruction")},
         {"scores": f"{flight}/{line}/scores.json"},
         work,
         **plan.switches("scoring"),
@@ -450,7 +509,7 @@ def bench_step(plan: Plan, bench: str) -> StageRecord:
 
     def work(to: Paths) -> dict[str, Any]:
         with _naming(bench=campaign.path(entry.file)):
-            result = bench_stage.run(campaign.bench(bench), plan.settings.bench)
+            result = bench_stage.run(campaign.bench(bench), plan.settings.bench, plan.effects("spectral"))
         write_dataset(result.to_dataset(), to["spectrum"])
         return {
             "relative_rms": result.relative_rms,
@@ -464,7 +523,7 @@ def bench_step(plan: Plan, bench: str) -> StageRecord:
         "bench",
         bench,
         ("stages.bench",),
-        {"settings": _plain(plan.settings.bench)},
+        {"settings": _plain(plan.settings.bench), "effects": plan.effects("spectral")},
         {"interferogram": campaign.path(entry.file)},
         {"spectrum": f"bench/{bench}.nc"},
         work,
@@ -478,39 +537,10 @@ def _needed(path: Path, stage: str) -> Path:
     return path
 
 
-def _has_temperatures(campaign: Campaign, flight: str) -> bool:
-    return campaign.imu(flight).temperatures is not None
-
-
-def _correction(model: Path, imu: Imu, method: str) -> ThermalCorrection:
-    assert imu.temperatures is not None
-    return thermal.ThermalModel.from_file(model).correction(imu.temperatures, method)
-
-
-def _reach(correction: ThermalCorrection) -> dict[str, Any]:
-    """Channels that were not compensated, and how far the flight left what the chamber taught, for a reader to know."""
-    values = np.hstack([correction.gyro, correction.accel])
-    names = [f"{sensor} {axis}" for sensor in ("gyro", "accel") for axis in "xyz"]
-    return {
-        "uncompensated": [n for n, column in zip(names, values.T, strict=True) if not column.any()],
-        "chamber_distance_max": float(correction.distance.max()),
-    }
-
-
-def _beyond(reach: Mapping[str, Any]) -> list[str]:
-    """What of that a reader must not miss."""
-    said = []
-    if reach["uncompensated"]:
-        names = ", ".join(reach["uncompensated"])
-        said.append(
-            f"left uncompensated, for want of a thermometer that moves or of a chamber run that teaches it: {names}"
-        )
-    if reach["chamber_distance_max"] > FAR_FROM_CHAMBER:
-        said.append(
-            f"temperatures go up to {reach['chamber_distance_max']:.1f} of their standard deviations beyond what the chamber "
-            "runs taught: the thermal correction holds its last trend there, with a wider sigma"
-        )
-    return said
+def _can_be_compensated(campaign: Campaign, flight: str) -> bool:
+    """Whether a thermal correction is still to be taken off, and there are temperatures to make it of."""
+    imu = campaign.imu(flight)
+    return imu.temperatures is not None and imu.compensated_by is None
 
 
 def _initial(campaign: Campaign, flight: str) -> tuple[float, np.ndarray, np.ndarray] | None:

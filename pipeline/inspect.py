@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from tsmftis.geodesy import SEMI_MAJOR_AXIS
 TURN_S = 2.0  # over which courses and turns are compared
 TURN_SPEED = 10.0  # m/s: below it a vehicle may turn without its course, or its course without it
 LEAST_TURN = 1.0  # rad of course change in all, for the comparison to mean anything
+LOOKED_AT = 64  # frames of a line that are looked at
+MOST_SATURATED = 1e-3  # share of pixels that may be saturated without a word
 FARTHEST_TARGET_DEG = 1.0  # from the nearest fix: farther is a mistake in the coordinates
 
 
@@ -95,14 +98,12 @@ def inspect_campaign(campaign: Campaign) -> Inspection:
                         "record the flight with the chamber's thermometers, or leave thermal out of campaign.yaml",
                     )
                 )
-            if keys.thermal is not None and imu.temperatures is None:
-                found.warnings.append(
-                    f"flight {flight.id}: the IMU file has no temperatures: its data are not compensated"
-                )
         if gnss is not None:
             _describe_gnss(f"flight {flight.id}: GNSS", gnss, found)
         if imu is not None and gnss is not None:
             found.attempt(_fit_together, campaign, flight, imu, gnss)
+        if imu is not None and keys.thermal is not None:
+            found.attempt(_describe_compensation, campaign.path(flight.imu), flight.id, imu, found)
         for line in flight.lines:
             _describe_line(campaign, flight.id, line.id, imu, gnss, found)
     for bench in keys.bench:
@@ -219,6 +220,21 @@ def _describe_imu(part: str, imu: Imu, nominal: float, found: Inspection) -> Non
         found.warnings.append(f"{part}: {gaps} gaps; attitude is bridged with the flight's own scatter as uncertainty")
 
 
+def _describe_compensation(file: Path, flight: str, imu: Imu, found: Inspection) -> None:
+    """What stands in the way of a thermal correction; InputError where the thermometers are on another clock."""
+    if imu.compensated_by is not None:
+        found.warnings.append(
+            f"flight {flight}: the IMU file is compensated already, by {imu.compensated_by}: it is not compensated again"
+        )
+    elif imu.temperatures is None:
+        found.warnings.append(f"flight {flight}: the IMU file has no temperatures: its data are not compensated")
+    elif gaps := imu.temperatures.uncovered(imu.time, file):
+        seconds = sum(stop - start for start, stop in gaps)
+        found.warnings.append(
+            f"flight {flight}: the thermometers do not cover {seconds:.0f} of {np.ptp(imu.time):.0f} s of the inertial data"
+        )
+
+
 def _describe_gnss(part: str, gnss: Gnss, found: Inspection) -> None:
     step = np.diff(gnss.time)
     shares = ", ".join(
@@ -302,14 +318,24 @@ def _describe_line(
     keys = campaign.line(flight, line)
     frames = found.attempt(campaign.frames, flight, line)
     if frames is not None:
-        last = frames.block(frames.time.size // 2, frames.time.size // 2 + 1)
-        saturated = float((last >= campaign.instrument.camera.saturation).mean()) if campaign.instrument.camera else 0.0
+        some = frames.sample(LOOKED_AT)
+        full = campaign.instrument.camera.saturation if campaign.instrument.camera else np.inf
+        saturated = float((some >= full).mean())
         found.add(
             part,
             frames=f"{frames.time.size} in {np.ptp(frames.time):.2f} s",
-            missing=f"{len(frames.segments()) - 1} gaps",
-            counts=f"{last.min()} to {last.max()} DN in the middle frame, {saturated:.1%} saturated",
+            missing=f"{frames.missing} in {len(frames.segments()) - 1} gaps",
+            counts=f"{some.min()} to {some.max()} DN, {saturated:.2%} of the pixels saturated",
         )
+        if frames.missing:
+            found.warnings.append(
+                f"{part}: {frames.missing} frames are missing in {len(frames.segments()) - 1} places: targets that were crossing "
+                "the detector there lack columns, which are interpolated, or are only partly seen"
+            )
+        if saturated > MOST_SATURATED:
+            found.warnings.append(
+                f"{part}: {saturated:.2%} of the pixels are saturated and left out: bright targets may be only partly seen"
+            )
         if imu is not None:
             latency = campaign.instrument.camera.latency if campaign.instrument.camera else 0.0
             time = frames.time - latency

@@ -5,7 +5,7 @@
       gnss_latency: {latency: 0.04}
       antenna_lever_arm: {x: 0.1, y: 0.0, z: -0.2}
 
-Names, parameters and units are those of `tsmftis.effects`; a parameter left out is zero.
+Names, parameters and units are those of `tsmftis.effects`; a parameter left out is zero, one of three axes a list of three.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from typing import Any
 
 from pipeline.errors import InputError
 from pipeline.yaml_file import load_yaml
-from tsmftis.effects import EFFECTS
+from tsmftis.effects import EFFECTS, Effect
 
 FORMAT = "tsmftis-model-update/1"
-Effects = dict[str, dict[str, float]]
+Effects = dict[str, dict[str, Any]]  # floats, and tuples of three where an effect has lists
 
 
 def read_model_update(path: Path, applied: frozenset[str]) -> Effects:
@@ -48,19 +48,35 @@ def _effect(path: Path, name: Any, given: Any, applied: frozenset[str]) -> dict[
             f"leave it out; updates are taken by {', '.join(sorted(applied))}",
         )
     if not isinstance(given, dict):
-        raise InputError(path, place, "holds no parameters", f"write {{{', '.join(f'{k}: …' for k in effect.units)}}}")
-    values = dict.fromkeys(effect.units, 0.0)
-    for key, value in given.items():
+        shape = ", ".join(f"{k}: {'[…, …, …]' if k in effect.lists else '…'}" for k in effect.units)
+        raise InputError(path, place, "holds no parameters", f"write {{{shape}}}")
+    for key in given:
         if key not in effect.units:
             raise InputError(path, f"{place[:-1]}.{key}'", "is no parameter", f"it has {', '.join(effect.units)}")
-        try:
-            number = math.nan if isinstance(value, bool) else float(value)  # YAML 1.1 reads 1e-6 as text
-        except (TypeError, ValueError):
-            number = math.nan
-        if not math.isfinite(number):
-            raise InputError(path, f"{place[:-1]}.{key}'", f"is {value!r}", f"give a number [{effect.units[key]}]")
-        if abs(number) > effect.largest[key]:
-            problem = f"is {number:g}, more than {effect.largest[key]:g} {effect.units[key]}"
-            raise InputError(path, f"{place[:-1]}.{key}'", problem, "correct the value or its unit")
-        values[key] = number
+    values: dict[str, Any] = {}
+    for key in effect.units:
+        where = f"{place[:-1]}.{key}'"
+        if key in effect.lists:
+            three = given.get(key, [0.0, 0.0, 0.0])
+            if not isinstance(three, list) or len(three) != 3:
+                raise InputError(path, where, f"is {three!r}", f"give a list of three, one an axis [{effect.units[key]}]")
+            values[key] = tuple(_number(path, where, value, effect, key) for value in three)
+        else:
+            values[key] = _number(path, where, given.get(key, 0.0), effect, key)
     return values
+
+
+def _number(path: Path, where: str, value: Any, effect: Effect, key: str) -> float:
+    unit = effect.units[key]
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)  # YAML 1.1 reads 1e-6 as text
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(path, where, f"is {value!r}", f"give a number [{unit}]")
+    if abs(number) > effect.largest[key]:
+        problem = f"is {number:g}, more than {effect.largest[key]:g} {unit}"
+        raise InputError(path, where, problem, "correct the value or its unit")
+    if number < (least := effect.least.get(key, -math.inf)):
+        raise InputError(path, where, f"is {number:g}, less than {least:g} {unit}", "correct or give the value")
+    return number

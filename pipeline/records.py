@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import itertools
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,13 +18,20 @@ from numpy.typing import NDArray
 
 from pipeline.datasets import checked, open_dataset, take, take_time
 from pipeline.errors import InputError
-from tsmftis.interferometer import Interferometer
+from tsmftis.effects import Effects
+from tsmftis.interferometer import Interferometer, response_with_effects
 
 Array = NDArray[np.float64]
 
 DATA_GAP = 2.5  # a step longer than this many usual ones is a gap in inertial data or fixes
+LADDER = ("nominal", "phase", "registration", "hybrid", "tracking", "true")  # methods that place a target, least first
+MOST_BAD_PIXELS = 0.2  # of a detector
 FRAME_DROP = 1.5  # an interval longer than this many usual ones means frames are missing
 GNSS_QUALITIES = {1: "fixed", 2: "float", 5: "single"}
+COLDEST, HOTTEST = -100.0, 150.0  # degC that a thermometer of an inertial unit can read
+THERMAL_TIME_S = 30.0  # over which temperatures are smoothed where nothing else is chosen
+COMPENSATED = "thermally_compensated_by"  # attribute of an imu file from which a thermal model has been taken off
+FAR_FROM_CHAMBER = 0.5  # standard deviations of a feature
 
 
 @dataclass(frozen=True)
@@ -44,11 +51,59 @@ class Temperatures:
             return None
         time = take_time(dataset, path, time_name)
         if "temperature" in dataset:
-            one = take(dataset, path, "temperature", (time_name,), "degC")
+            one = _taken_warm(dataset, path, "temperature", (time_name,), (None,))
             return cls(time, np.repeat(one[:, None, None], 3, axis=1), np.repeat(one[:, None], 3, axis=1))
-        gyro = take(dataset, path, "temperature_gyro", (time_name, "axis", "thermometer"), "degC", shape=(None, 3, 3))
-        accel = take(dataset, path, "temperature_accel", (time_name, "axis"), "degC", shape=(None, 3))
+        gyro = _taken_warm(dataset, path, "temperature_gyro", (time_name, "axis", "thermometer"), (None, 3, 3))
+        accel = _taken_warm(dataset, path, "temperature_accel", (time_name, "axis"), (None, 3))
         return cls(time, gyro, accel)
+
+    def uncovered(
+        self, time: Array, where: Path | str, smoothing_s: float = THERMAL_TIME_S
+    ) -> list[tuple[float, float]]:
+        """Stretches (start, stop) [s] of inertial data at times (n,) [s] for which there are no readings.
+
+        Before the first and after the last reading half a time constant of the smoothing is no matter, between two readings
+        four are not, nor are the usual intervals of a slow log. InputError, about `where`, where readings and inertial data have
+        less than three time constants (of a short flight, half of it) in common.
+        """
+        start, stop = float(time[0]), float(time[-1])
+        first, last = float(self.time[0]), float(self.time[-1])
+        common = min(stop, last) - max(start, first)
+        if common < min(3.0 * smoothing_s, 0.5 * (stop - start)):
+            raise InputError(
+                where,
+                "variable 'time_temperature'",
+                f"spans {first:.1f} to {last:.1f} s and the inertial data {start:.1f} to {stop:.1f} s: "
+                f"{max(common, 0.0):.1f} s in common",
+                "both must be seconds on the campaign's one clock, and the thermometers be read in flight",
+            )
+        step = np.diff(self.time)
+        usual = DATA_GAP * float(np.median(step))
+        gaps = [(start, first)] if first - start > max(0.5 * smoothing_s, usual) else []
+        for i in np.flatnonzero(step > max(4.0 * smoothing_s, usual)):
+            stretch = max(start, float(self.time[i])), min(stop, float(self.time[i + 1]))
+            if stretch[0] < stretch[1]:
+                gaps.append(stretch)
+        if stop - last > max(0.5 * smoothing_s, usual):
+            gaps.append((last, stop))
+        return gaps
+
+
+def _taken_warm(
+    dataset: xr.Dataset, path: Path, name: str, dims: tuple[str, ...], shape: tuple[int | None, ...]
+) -> Array:
+    """Readings [degC] that a thermometer can give."""
+    values = take(dataset, path, name, dims, "degC", shape=shape)
+    outside = (values < COLDEST) | (values > HOTTEST)
+    if outside.any():
+        first = int(np.argwhere(outside)[0][0])
+        raise InputError(
+            path,
+            f"variable '{name}'",
+            f"is {values[outside][0]:.4g} degC at reading {first}, outside {COLDEST:g} to {HOTTEST:g}",
+            "is this kelvin? Convert it; or remove the reading",
+        )
+    return values
 
 
 def _inertial(dataset: xr.Dataset, path: Path) -> tuple[Array, Array, Array]:
@@ -90,12 +145,15 @@ class Imu:
     gyro: Array
     accel: Array
     temperatures: Temperatures | None = None
+    compensated_by: str | None = None  # the thermal model that has been taken off already, by its file's mark
 
     @classmethod
     def from_file(cls, path: Path) -> Imu:
         with open_dataset(path) as dataset:
             time_name = "time_temperature" if "time_temperature" in dataset.variables else "time"
-            return cls(*_inertial(dataset, path), Temperatures.from_dataset(dataset, path, time_name))
+            inertial = _inertial(dataset, path)
+            mark = str(dataset.attrs.get(COMPENSATED, ""))
+            return cls(*inertial, Temperatures.from_dataset(dataset, path, time_name), mark or None)
 
 
 @dataclass(frozen=True)
@@ -270,13 +328,30 @@ class Frames:
             ) from error
         return cls(time, counts.variable)
 
-    def segments(self, start: int = 0, stop: int | None = None) -> list[tuple[int, int]]:
+    def segments(self) -> list[tuple[int, int]]:
         """Runs (first, one past last) without a dropped frame inside; values are not interpolated across a drop."""
-        stop = self.time.size if stop is None else stop
         step = np.diff(self.time)
         drops = np.flatnonzero(step > FRAME_DROP * np.median(step)) + 1
-        edges = [start, *(int(i) for i in drops if start < i < stop), stop]
-        return list(itertools.pairwise(edges))
+        return list(itertools.pairwise([0, *(int(i) for i in drops), self.time.size]))
+
+    @property
+    def missing(self) -> int:
+        """How many frames were dropped, by the gaps in their times."""
+        step = np.diff(self.time)
+        usual = float(np.median(step))
+        return int(np.round(step[step > FRAME_DROP * usual] / usual - 1.0).sum())
+
+    def blocks(self, size: int) -> list[tuple[int, int]]:
+        """Blocks (first, one past last) of at most size + 1 frames that share their end frames, none across a drop."""
+        return [
+            (first, min(first + size + 1, stop))
+            for start, stop in self.segments()
+            for first in range(start, max(stop - 1, start + 1), size)
+        ]
+
+    def sample(self, count: int) -> NDArray[np.uint16]:
+        """About so many frames, evenly spread."""
+        return np.asarray(self.counts[:: max(1, self.time.size // count)], dtype=np.uint16)
 
     def block(self, start: int, stop: int) -> NDArray[np.uint16]:
         """Frames start:stop in memory."""
@@ -285,7 +360,10 @@ class Frames:
 
 @dataclass(frozen=True)
 class Calibration:
-    """dark (row, col) [DN], flat (row, col) [1], response (wavenumber) [DN per radiance unit and m-1], wavenumber [m-1]."""
+    """dark (row, col) [DN], flat (row, col) [1], response (wavenumber) [DN per radiance unit and m-1], wavenumber [m-1].
+
+    Pixels that are not finite in dark or flat, or whose flat is not positive, are bad ones and left out.
+    """
 
     dark: Array
     flat: Array
@@ -295,17 +373,18 @@ class Calibration:
     @classmethod
     def from_file(cls, path: Path, rows: int, cols: int) -> Calibration:
         with open_dataset(path) as dataset:
-            dark = take(dataset, path, "dark", ("row", "col"), "DN", shape=(rows, cols))
-            flat = take(dataset, path, "flat", ("row", "col"), "1", shape=(rows, cols))
+            dark = take(dataset, path, "dark", ("row", "col"), "DN", shape=(rows, cols), finite=False)
+            flat = take(dataset, path, "flat", ("row", "col"), "1", shape=(rows, cols), finite=False)
             wavenumber = take(dataset, path, "wavenumber", ("wavenumber",), "m-1")
             response = take(dataset, path, "response", ("wavenumber",), None)
-        if (flat <= 0).any():
-            raise InputError(
-                path,
-                "variable 'flat'",
-                f"is not positive in {int((flat <= 0).sum())} pixels",
-                "give dead pixels the flat of their neighbours",
-            )
+        for name, usable in (("dark", np.isfinite(dark)), ("flat", np.isfinite(flat) & (flat > 0.0))):
+            if usable.mean() < 1.0 - MOST_BAD_PIXELS:
+                raise InputError(
+                    path,
+                    f"variable '{name}'",
+                    f"is of no use in {int((~usable).sum())} of {usable.size} pixels",
+                    "measure it again: that many bad pixels leave no instrument",
+                )
         if (np.diff(wavenumber) <= 0).any():
             raise InputError(path, "variable 'wavenumber'", "does not increase", "sort it")
         if (response <= 0).any():
@@ -316,6 +395,14 @@ class Calibration:
                 "cut the table to where the instrument responds",
             )
         return cls(dark, flat, wavenumber, response)
+
+    def without(self, bad: NDArray[np.bool_]) -> Calibration:
+        """The calibration with these pixels (row, col) marked as bad, for `detector.correct` to leave out."""
+        return replace(self, dark=np.where(bad, np.nan, self.dark))
+
+    def with_effects(self, effects: Effects) -> Calibration:
+        """The calibration with the response that a model update makes of it."""
+        return replace(self, response=response_with_effects(self.wavenumber, self.response, effects))
 
 
 @dataclass(frozen=True)
@@ -679,15 +766,17 @@ class Tracks:
                 {k.removeprefix("note_"): str(v) for k, v in d.attrs.items() if k.startswith("note_")},
             )
 
+    def only(self, method: str) -> Tracks:
+        """One method's tracks."""
+        i = self.methods.index(method)
+        return Tracks((method,), self.targets, self.row[[i]], self.col[[i]])
+
     def joined(self, other: Tracks) -> Tracks:
-        """The methods of both, for the same targets and frames."""
-        return Tracks(
-            self.methods + other.methods,
-            self.targets,
-            np.concatenate([self.row, other.row]),
-            np.concatenate([self.col, other.col]),
-            self.notes | other.notes,
-        )
+        """The methods of both, for the same targets and frames, in the ladder's order."""
+        methods = self.methods + other.methods
+        order = sorted(range(len(methods)), key=lambda i: LADDER.index(methods[i]))
+        row, col = (np.concatenate([getattr(t, n) for t in (self, other)])[order] for n in ("row", "col"))
+        return Tracks(tuple(methods[i] for i in order), self.targets, row, col, self.notes | other.notes)
 
 
 @dataclass(frozen=True)
@@ -761,7 +850,8 @@ class ThermalCorrection:
     """What the thermal model takes off a flight's inertial data, in the IMU's own axes.
 
     time (m,) [s]; bias of gyro (m, 3) [rad/s] and accel (m, 3) [m/s²] to be subtracted; their predictive sigmas;
-    `distance` (m, 6): how far each channel's features lie outside what the chamber taught (0 inside).
+    `distance` (m, 6): how far each channel's features lie outside what the chamber taught (0 inside, and where nothing is taken
+    off). `uncovered_s` [s]: for how long there were no readings; the bias is held or interpolated there.
     """
 
     time: Array
@@ -770,6 +860,48 @@ class ThermalCorrection:
     sigma_gyro: Array
     sigma_accel: Array
     distance: Array
+    uncovered_s: float = 0.0
+
+    def taken_off(self, imu: Imu) -> Imu:
+        """The inertial data less the bias: linear between the correction's times, its ends held."""
+        gyro, accel = (
+            values - np.stack([np.interp(imu.time, self.time, column) for column in bias.T], axis=1)
+            for values, bias in ((imu.gyro, self.gyro), (imu.accel, self.accel))
+        )
+        return replace(imu, gyro=gyro, accel=accel)
+
+    @property
+    def reach(self) -> dict[str, Any]:
+        """Channels from which nothing is taken off, how far the rest left what the chamber taught [its standard deviations], and
+        for how long there were no readings [s]: plain data for run.json."""
+        channels = [f"{sensor} {axis}" for sensor in ("gyro", "accel") for axis in "xyz"]
+        values = np.hstack([self.gyro, self.accel])
+        return {
+            "uncompensated": [n for n, column in zip(channels, values.T, strict=True) if not column.any()],
+            "chamber_distance_max": float(self.distance.max()),
+            "thermometers_missing_s": self.uncovered_s,
+        }
+
+    @property
+    def warnings(self) -> list[str]:
+        """What of that a reader must not miss."""
+        reach, said = self.reach, []
+        if reach["uncompensated"]:
+            names = ", ".join(reach["uncompensated"])
+            said.append(
+                f"left uncompensated, for want of a thermometer that moves or of a chamber run that teaches it: {names}"
+            )
+        if reach["chamber_distance_max"] > FAR_FROM_CHAMBER:
+            said.append(
+                f"temperatures go up to {reach['chamber_distance_max']:.1f} of their standard deviations beyond what the chamber "
+                "runs taught: the thermal correction is extrapolated there, with a wider sigma"
+            )
+        if self.uncovered_s > 0.0:
+            said.append(
+                f"the thermometers do not cover {self.uncovered_s:.0f} s of the inertial data: the thermal correction is held "
+                "or interpolated there, with the sigma of no correction"
+            )
+        return said
 
     def to_dataset(self) -> xr.Dataset:
         dims = ("time", "axis")
@@ -797,6 +929,7 @@ class ThermalCorrection:
                 ),
             },
             {"time": (("time",), self.time, {"units": "s"}), "axis": ["x", "y", "z"]},
+            {"uncovered_s": self.uncovered_s},
         )
 
     @classmethod
@@ -810,6 +943,7 @@ class ThermalCorrection:
                 take(d, path, "sigma_gyro", dims, "rad s-1"),
                 take(d, path, "sigma_accel", dims, "m s-2"),
                 take(d, path, "distance", ("time", "channel"), "1"),
+                float(d.attrs.get("uncovered_s", 0.0)),
             )
 
 
@@ -842,6 +976,58 @@ class CameraPoses:
                 take(d, path, "centre", ("frame", "ecef"), "m", finite=False),
                 take(d, path, "dcm", ("frame", "ecef", "camera"), "1", finite=False),
             )
+
+
+@dataclass(frozen=True)
+class Products:
+    """Spectra under the window, phase correction and spacing that were asked for (target, wavenumber); they are not scored.
+
+    radiance: of the centre; panel: of the best mean over the whole panel, of `panel_points` (target,) points; reference at
+    the same line shape; imaginary (target,): mean of (Im/σ)² of the centre's two-sided spectrum, about 1 where all is well;
+    contrast (target,): rms difference of the surroundings' interferogram to the panel's over the panel's rms.
+    """
+
+    method: str
+    targets: tuple[str, ...]
+    wavenumber: Array
+    radiance: Array
+    sigma_radiance: Array
+    panel: Array
+    sigma_panel: Array
+    reference: Array
+    panel_points: NDArray[np.int64]
+    imaginary: Array
+    contrast: Array
+    attributes: dict[str, str | float] = field(default_factory=dict)
+
+    def to_dataset(self) -> xr.Dataset:
+        dims = ("target", "wavenumber")
+        unit = {"units": "reference radiance unit"}
+        names = {
+            "radiance": "centre point",
+            "sigma_radiance": "its standard deviation",
+            "panel": "best mean over the whole panel",
+            "sigma_panel": "its standard deviation",
+            "reference": "reference at the same line shape",
+        }
+        return xr.Dataset(
+            {
+                **{n: (dims, getattr(self, n), unit | {"long_name": said}) for n, said in names.items()},
+                "panel_points": (dims[:1], self.panel_points, {"units": "1"}),
+                "imaginary": (
+                    dims[:1],
+                    self.imaginary,
+                    {"units": "1", "long_name": "mean of (Im/sigma)^2 of the two-sided spectrum"},
+                ),
+                "contrast": (dims[:1], self.contrast, {"units": "1", "long_name": "of surroundings to panel"}),
+            },
+            {
+                "target": list(self.targets),
+                "wavenumber": (("wavenumber",), self.wavenumber, {"units": "m-1"}),
+                "wavelength": (("wavenumber",), 1e9 / self.wavenumber, {"units": "nm"}),
+            },
+            {"method": self.method} | self.attributes,
+        )
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,10 @@ Functions
 ---------
 Camera.project          camera frame → row, column
 Camera.directions       row, column → unit directions in the camera frame (the inverse)
-Mounting                IMU→body rotation, lever arms, boresight
+Mounting                IMU→body rotation, lever arms, boresight, and how far it gives way
 camera_pose             projection centre and C_camera→ECEF from a body pose
+angular_acceleration    what a mount bends under, from the rates of the unit
+Camera.with_effects, Mounting.with_effects      what a model update adds
 
 The camera's x points forward, y right, z along the optical axis (down). With x = X/Z, y = Y/Z and
 s = 1 + k1·(x² + y²): row = row0 + s·y·f/p, col = col0 − s·x·f/p; pixel centres lie at integers.
@@ -13,15 +15,21 @@ s = 1 + k1·(x² + y²): row = row0 + s·y·f/p, col = col0 − s·x·f/p; pixel
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+from scipy.signal import butter, sosfiltfilt
 
+from tsmftis.effects import Effects, amounts
 from tsmftis.geodesy import geodetic_to_ecef, ned_to_ecef_dcm
-from tsmftis.rotation import rpy_to_dcm
+from tsmftis.rotation import exp_so3, rpy_to_dcm
 
 Array = NDArray[np.float64]
+
+FLEXURE_CUTOFF = 12.0  # Hz, above which a mount does not follow
+DRIFT_REFERENCE = 25.0  # degC, of the accelerometers, at which the boresight is the declared one
 
 
 @dataclass(frozen=True)
@@ -68,15 +76,33 @@ class Camera:
         """Nominal ground sample p·distance/f [m]."""
         return self.pixel_pitch * distance / self.focal_length
 
+    def with_effects(self, effects: Effects) -> Camera:
+        """latency + camera_latency, f·(1 + focal_length), k1 + radial_distortion."""
+        (late,), (scale,), (k1,) = (
+            amounts(effects, name) for name in ("camera_latency", "focal_length", "radial_distortion")
+        )
+        return replace(
+            self,
+            latency=self.latency + late,
+            focal_length=self.focal_length * (1.0 + scale),
+            radial_k1=self.radial_k1 + k1,
+        )
+
 
 @dataclass(frozen=True)
 class Mounting:
-    """How IMU, antenna and camera sit in the body (FRD): angles [rad], lever arms from the IMU [m]."""
+    """How IMU, antenna and camera sit in the body (FRD): angles [rad], lever arms from the IMU [m].
+
+    C_camera→body = Exp(flexure_roll·α_x, flexure_pitch·α_y, 0)·Exp(drift·(T − 25 °C))·C_boresight; no declared mount bends or
+    drifts. drift (3,) [rad/K], flexure (2,) [rad per rad/s²].
+    """
 
     imu_to_antenna: Array
     imu_to_camera: Array = field(default_factory=lambda: np.zeros(3))
     boresight: Array = field(default_factory=lambda: np.zeros(3))
     imu_to_body: Array = field(default_factory=lambda: np.zeros(3))
+    drift: Array = field(default_factory=lambda: np.zeros(3))
+    flexure: Array = field(default_factory=lambda: np.zeros(2))
 
     @property
     def dcm_imu_to_body(self) -> Array:
@@ -86,11 +112,61 @@ class Mounting:
     def dcm_camera_to_body(self) -> Array:
         return rpy_to_dcm(*self.boresight)
 
+    def dcm_at(self, temperature: Array | None, acceleration: Array | None) -> Array:
+        """C_camera→body (3, 3), or (n, 3, 3) where the mount drifts or bends.
+
+        temperature (n,) [degC]: mean of the accelerometers, needed for drift; acceleration (n, 3) [rad/s²], for flexure.
+        """
+        dcm = self.dcm_camera_to_body
+        if self.drift.any():
+            if temperature is None:
+                raise ValueError("a boresight that drifts needs temperatures")
+            dcm = exp_so3((temperature - DRIFT_REFERENCE)[:, None] * self.drift) @ dcm
+        if self.flexure.any():
+            if acceleration is None:
+                raise ValueError("a mount that bends needs angular accelerations")
+            bend = np.zeros((len(acceleration), 3))
+            bend[:, :2] = self.flexure * acceleration[:, :2]
+            dcm = exp_so3(bend) @ dcm
+        return dcm
+
+    def with_effects(self, effects: Effects) -> Mounting:
+        """boresight + boresight, drift + boresight_thermal_drift, flexure + mount_flexure."""
+        return replace(
+            self,
+            boresight=self.boresight + amounts(effects, "boresight"),
+            drift=self.drift + amounts(effects, "boresight_thermal_drift"),
+            flexure=self.flexure + amounts(effects, "mount_flexure"),
+        )
+
 
 def camera_pose(
-    latitude: Array, longitude: Array, height: Array, body_to_ned: Array, mounting: Mounting
+    latitude: Array,
+    longitude: Array,
+    height: Array,
+    body_to_ned: Array,
+    mounting: Mounting,
+    temperature: Array | None = None,
+    acceleration: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Projection centre (..., 3) [m] in ECEF and C_camera→ECEF (..., 3, 3) from the IMU's pose."""
+    """Projection centre (..., 3) [m] in ECEF and C_camera→ECEF (..., 3, 3) from the IMU's pose.
+
+    temperature, acceleration: as in `Mounting.dcm_at`.
+    """
     body_to_ecef = ned_to_ecef_dcm(latitude, longitude) @ body_to_ned
     centre = geodetic_to_ecef(latitude, longitude, height) + body_to_ecef @ mounting.imu_to_camera
-    return centre, body_to_ecef @ mounting.dcm_camera_to_body
+    return centre, body_to_ecef @ mounting.dcm_at(temperature, acceleration)
+
+
+def angular_acceleration(time: Array, rate: Array, at: Array) -> Array:
+    """α = dω/dt (k, 3) [rad/s²] at times (k,), of mean rates ω (n, 3) [rad/s] over the intervals that end at time (n,) [s].
+
+    A second-order Butterworth low pass at 12 Hz, forwards and backwards (zero phase), then the derivative of a cubic spline
+    through the intervals' middles. A gap is bridged by a straight line.
+    """
+    step = float(np.median(np.diff(time)))
+    even = time[0] + step * np.arange(int(np.ceil((time[-1] - time[0]) / step - 1e-6)) + 1)
+    smooth = np.stack([np.interp(even, time, axis) for axis in rate.T], -1)
+    if FLEXURE_CUTOFF < 0.5 / step:
+        smooth = sosfiltfilt(butter(2, FLEXURE_CUTOFF, fs=1.0 / step, output="sos"), smooth, axis=0)
+    return np.asarray(make_interp_spline(even - 0.5 * step, smooth).derivative()(at))

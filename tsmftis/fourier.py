@@ -17,8 +17,9 @@ remove_constant     DC and slow drift
 transform           S(σ)
 phase_polynomial, smooth_phase      φ(σ) from the two-sided part
 fringe_centre       the OPD that φ's slope shifts the fringes to
+operator, forman_operator   the linear map from interferogram to B(σ), after Mertz and after Forman
 radiance            B(σ) and its sigma
-line_shape_response B as the instrument's line shape shows it
+line_shape_response, line_width     B as the instrument's line shape shows it, and that shape's width
 rqe                 relative quadratic error
 
 References
@@ -27,6 +28,8 @@ References
 .. [2] S. P. Davis, M. C. Abrams, J. W. Brault, Fourier Transform Spectrometry, Academic Press 2001.
 .. [3] G. P. Happ, L. Genzel, Interferenz-Modulation mit monochromatischen Millimeterwellen, Infrared Phys. 1 (1961) 39.
 .. [4] R. H. Norton, R. Beer, New apodizing functions for Fourier spectrometry, JOSA 66 (1976) 259; 67 (1977) 419 (errata).
+.. [5] M. L. Forman, W. H. Steel, G. A. Vanasse, Correction of asymmetric interferograms obtained in Fourier spectroscopy,
+       JOSA 56 (1966) 59.
 """
 
 from __future__ import annotations
@@ -196,6 +199,46 @@ def fringe_centre(phase: Array, wavenumber: Array) -> float:
     return float(-np.polyfit(wavenumber, phase, 1)[0] / (2.0 * np.pi))
 
 
+def operator(opd: Array, window: Array, wavenumber: Array, phase: Array, response: Array) -> Array:
+    """The matrix (n, k) that takes an interferogram (n,) to B = 4·Re(S·exp(−iφ))/R: 4·w·dx·cos(2πσx + φ)/R.
+
+    window (n,) must hold a Mertz ramp; phase, response (k,) on wavenumber (k,). With the phase turned by −π/2 it gives the
+    imaginary part. Its squares take the variances of white samples to the variance of B.
+    """
+    angle = 2.0 * np.pi * np.outer(opd, wavenumber) + phase
+    return (4.0 * window * quadrature(opd))[:, None] * np.cos(angle) / response
+
+
+def forman_operator(
+    opd: Array,
+    apodized: Array,
+    wavenumber: Array,
+    response: Array,
+    band: Array,
+    band_phase: Array,
+) -> Array:
+    """`operator` by Forman's way [5]_: the interferogram is made symmetric by a convolution, then transformed from one side.
+
+    I′(x) = ∫ I(y)·p(x − y) dy with p(x) = 2∫ cos(2πσx − φ) dσ over `band` (m,), all wavenumbers with light, and φ there;
+    B = 4·∫₀ w(x)·I′(x)·cos(2πσx) dx/R over the long side. opd (n,) need not be uniform; apodized (n,): the window w without
+    a ramp; response (k,) on wavenumber (k,). Where Mertz's ramp weighs the short side down gradually, here it counts fully
+    and its end cuts the convolution off. `band` must be finer than 1/(4·ptp(opd)).
+    """
+    sign = 1.0 if opd.max() >= -opd.min() else -1.0
+    far, step = sign * opd[np.argmax(sign * opd)], float(np.median(np.abs(np.diff(opd))))
+    side = sign * np.arange(0.0, sign * far + 0.5 * step, step)
+    turned = np.exp(2j * np.pi * np.outer(opd, band) + 1j * band_phase) * quadrature(band)
+    kernel = 2.0 * np.real(turned @ np.exp(-2j * np.pi * np.outer(band, side)))
+    weight = np.interp(side, *_rising(opd, apodized)) * quadrature(side)
+    back = weight[:, None] * np.cos(2.0 * np.pi * np.outer(side, wavenumber))
+    return 4.0 * (quadrature(opd)[:, None] * kernel) @ back / response
+
+
+def _rising(x: Array, y: Array) -> tuple[Array, Array]:
+    order = np.argsort(x)
+    return x[order], y[order]
+
+
 def radiance(
     interferogram: Array,
     opd: Array,
@@ -205,30 +248,24 @@ def radiance(
     response: Array,
     variance: Array | None = None,
 ) -> tuple[Array, Array]:
-    """B = 4·Re(S·exp(−iφ))/R and its sigma; the window must hold a Mertz ramp.
+    """B = 4·Re(S·exp(−iφ))/R and its sigma, zero where no variance is given; see `operator`.
 
-    interferogram, variance (..., n): AC part and variance of each sample (white between samples), window and opd as
-    `transform`; phase, response (k,). sigma² = (4/R)²·Σ (w·dx·cos(2πσx + φ))²·var; zero where no variance is given.
+    interferogram, variance (..., n): AC part and variance of each sample (white between samples); opd and window (n,), or
+    like the interferograms where each has its own. sigma² = (4/R)²·Σ (w·dx·cos(2πσx + φ))²·var.
     """
+    if opd.ndim == 1:
+        matrix = operator(opd, window, wavenumber, phase, response).astype(interferogram.dtype, copy=False)
+        value = interferogram @ matrix
+        return value, np.zeros_like(value) if variance is None else np.sqrt(variance @ matrix**2)
     spectrum = transform(interferogram, opd, window, wavenumber)
     value = 4.0 * np.real(spectrum * np.exp(-1j * phase)) / response
     if variance is None:
         return value, np.zeros_like(value)
-    weight = (window * quadrature(opd)) ** 2
-    if opd.ndim == 1:
-        gain = np.cos(2.0 * np.pi * np.outer(opd, wavenumber) + phase) ** 2
-        total = (variance * weight) @ gain
-    else:
-        flat, w, x = (
-            np.broadcast_to(a, variance.shape).reshape(-1, variance.shape[-1]) for a in (variance, weight, opd)
-        )
-        total = np.stack(
-            [
-                (v * ww) @ np.cos(2.0 * np.pi * np.outer(at, wavenumber) + phase) ** 2
-                for v, ww, at in zip(flat, w, x, strict=True)
-            ]
-        ).reshape(*variance.shape[:-1], wavenumber.size)
-    return value, 4.0 * np.sqrt(total) / response
+    flat, w, x = (np.broadcast_to(a, variance.shape).reshape(-1, variance.shape[-1]) for a in (variance, window, opd))
+    total = np.stack(
+        [v @ operator(at, ww, wavenumber, phase, response) ** 2 for v, ww, at in zip(flat, w, x, strict=True)]
+    )
+    return value, np.sqrt(total).reshape(*variance.shape[:-1], wavenumber.size)
 
 
 def line_shape_response(
@@ -248,6 +285,16 @@ def line_shape_response(
     back = np.cos(2.0 * np.pi * np.outer(x, wavenumber)) * (apodization(name, x / longest_opd) * dx)[:, None]
     # Both sides are equal, hence 4 instead of 2 over one side.
     return 4.0 * (spectrum @ forward) @ back / np.interp(wavenumber, table_wavenumber, response)
+
+
+def line_width(name: str, longest_opd: float) -> float:
+    """Full width at half maximum [m-1] of the line shape f(σ) = ∫₀ᴸ w(x)·cos(2πσx) dx of a window `name` of half-length L [m]."""
+    u = np.linspace(0.0, 1.0, 2001)
+    s = np.linspace(0.0, 4.0, 4001)  # σ·L
+    shape = np.cos(2.0 * np.pi * np.outer(s, u)) @ (apodization(name, u) * quadrature(u))
+    below = int(np.argmax(shape < 0.5 * shape[0]))
+    half = np.interp(0.5 * shape[0], shape[[below, below - 1]], s[[below, below - 1]])
+    return float(2.0 * half / longest_opd)
 
 
 def rqe(spectrum: Array, reference: Array) -> Array:

@@ -4,14 +4,18 @@ Functions
 ---------
 Interferometer.opd          OPD(row, col) = step·d + quadratic·d² + tilt·(row − (rows−1)/2), d = col − zpd_col
 Interferometer.scored_wavenumbers
+Interferometer.with_effects what a model update adds
+response_with_effects       the same for the calibrated response
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from tsmftis.effects import Effects, amounts
 
 Array = NDArray[np.float64]
 
@@ -53,3 +57,24 @@ class Interferometer:
     def scored_wavenumbers(self, step: float = 5000.0) -> Array:
         """1/λ_high, + step, … up to 1/λ_low [m-1]."""
         return np.arange(1.0 / self.wavelength_high, 1.0 / self.wavelength_low, step)
+
+    def with_effects(self, effects: Effects) -> Interferometer:
+        """step·(1 + opd_scale), quadratic + opd_quadratic, tilt + fringe_tilt, a + detector_nonlinearity."""
+        (scale,), (quadratic,), (tilt,), (a,) = (
+            amounts(effects, name) for name in ("opd_scale", "opd_quadratic", "fringe_tilt", "detector_nonlinearity")
+        )
+        return replace(
+            self,
+            opd_step=self.opd_step * (1.0 + scale),
+            opd_quadratic=self.opd_quadratic + quadratic,
+            fringe_tilt=self.fringe_tilt + tilt,
+            detector_nonlinearity=self.detector_nonlinearity + a,
+        )
+
+
+def response_with_effects(wavenumber: Array, response: Array, effects: Effects) -> Array:
+    """response·(1 + response_scale)·(1 + amplitude·cos(2πσ·thickness + phase)), the latter of channel_fringe."""
+    (scale,) = amounts(effects, "response_scale")
+    amplitude, thickness, phase = amounts(effects, "channel_fringe")
+    fringe = 1.0 + amplitude * np.cos(2.0 * np.pi * wavenumber * thickness + phase)
+    return response * (1.0 + scale) * fringe

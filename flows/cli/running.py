@@ -14,12 +14,14 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from flows.results import SCORES
 from flows.settings import load_settings
 from flows.steps import STAGES, UPDATED, Plan
 from pipeline.campaign import Campaign, read_campaign
 from pipeline.errors import InputError
 from pipeline.inspect import check_campaign
 from pipeline.model_update import read_model_update
+from pipeline.records import LADDER
 from pipeline.run_stage import StageRecord
 from pipeline.truth import true_poses_file
 
@@ -92,7 +94,7 @@ def run(
         raise InputError(out, "--out", "is a file", "give a folder")
     if plan.campaign.is_relative_to(plan.out) or plan.out.is_relative_to(plan.campaign):
         raise InputError(out, "--out", "would write into the campaign's own place", "give another folder")
-    _belongs(plan, opened.keys.name, out)
+    belongs(plan, opened.keys.name, out)
     inspection = check_campaign(opened)
     for warning in inspection.warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False)
@@ -102,7 +104,7 @@ def run(
         raise InputError(out, "--out", f"cannot be made ({error.strerror})", "give another folder") from error
 
     try:
-        with _alone(plan, out):
+        with alone(plan, out):
             _process(plan, opened, inspection.warnings, dask, console)
     finally:
         # Where nothing came of the run, nothing is left of it either.
@@ -141,6 +143,9 @@ def _process(plan: Plan, opened: Campaign, warnings: list[str], dask: str | None
     for flight, entry in content["flights"].items():
         for said in (entry["navigation"] or {}).get("warnings", []):
             console.print(f"warning: flight {flight}: {said}", style="yellow", markup=False)
+        for line, results in entry["lines"].items():
+            for said in results.get("mapping", {}).get("warnings", []):
+                console.print(f"warning: line {flight}/{line}: {said}", style="yellow", markup=False)
     console.print(f"report: {_short(report)}   ({time.perf_counter() - started:.0f} s)", markup=False)
     if wrong_input:
         raise wrong_input
@@ -148,7 +153,7 @@ def _process(plan: Plan, opened: Campaign, warnings: list[str], dask: str | None
         raise typer.Exit(1)
 
 
-def _belongs(plan: Plan, name: str, out: Path) -> None:
+def belongs(plan: Plan, name: str, out: Path) -> None:
     """A folder holds the results of one campaign: another's would be overwritten where ids are alike, and mixed elsewhere."""
     try:
         before = json.loads((plan.out / "run.json").read_text(encoding="utf-8")).get("campaign")
@@ -164,7 +169,7 @@ def _belongs(plan: Plan, name: str, out: Path) -> None:
 
 
 @contextlib.contextmanager
-def _alone(plan: Plan, out: Path) -> Iterator[None]:
+def alone(plan: Plan, out: Path) -> Iterator[None]:
     """One run at a time in a folder; the lock goes with the process, however it ends."""
     path = plan.out / ".lock"
     with path.open("w") as stream:
@@ -190,13 +195,12 @@ def print_scores(console: Console, content: dict[str, Any]) -> None:
         title_justify="left",
     )
     table.add_column("method")
-    for name in ("one point", "area mean", "targets"):
+    for name in ("one point", "by noise alone", "area mean", "by noise alone", "targets"):
         table.add_column(name, justify="right")
-    for method, value in content["rqe"].items():
-        area = content["rqe_area"].get(method)
-        table.add_row(
-            method, f"{value:.4f}", "–" if area is None else f"{area:.4f}", str(content["targets_scored"][method])
-        )
+    for method in sorted(content["rqe"], key=LADDER.index):
+        values = [source[kind].get(method) for kind in SCORES for source in (content, content["noise_limit"])]
+        shown = ["–" if v is None else f"{v:.4f}" for v in values]
+        table.add_row(method, *shown, str(content["targets_scored"][method]))
     console.print(table)
     for method, targets in content["partly_seen"].items():
         console.print(f"not seen well enough under {method}: {', '.join(targets)}", markup=False)

@@ -19,7 +19,9 @@ Array = NDArray[np.float64]
 
 COLOURS = {
     "nominal": "#8c8c8c",
-    "true": "#2a9d3a",
+    "phase": "#b07aa1",
+    "hybrid": "#8a5a00",
+    "true": "#a5d8ac",
     "registration": "#e07b00",
     "tracking": "#0b63b0",
     "reference": "#111111",
@@ -30,6 +32,7 @@ NED = ("north", "east", "down")
 ANGLES = ("roll", "pitch", "yaw")
 PALETTE = ("#0b63b0", "#e07b00", "#3a9a4d")  # of three axes
 MOST_POINTS = 1500
+FAR_OFF = ("nominal", "phase")  # methods whose spectra would only hide the others
 
 
 def layout(figure: go.Figure, height: int, title: str | None = None) -> go.Figure:
@@ -47,7 +50,14 @@ def layout(figure: go.Figure, height: int, title: str | None = None) -> go.Figur
 
 def _stroke(method: str, width: float) -> dict[str, Any]:
     """A method's line; registration is dashed, so that tracking shows where both agree."""
-    return {"color": COLOURS.get(method), "width": width, "dash": "dash" if method == "registration" else "solid"}
+    dash = {"registration": "dash", "hybrid": "dashdot"}.get(method, "solid")
+    # The truth lies broad and pale beneath what should run along it.
+    return {"color": COLOURS.get(method), "width": 3.0 * width if method == "true" else width, "dash": dash}
+
+
+def _bottom_up(methods: tuple[str, ...]) -> list[tuple[int, str]]:
+    """Methods and their places in the order of drawing."""
+    return sorted(enumerate(methods), key=lambda m: m[1] != "true")
 
 
 def thin(*series: Array) -> list[list[float]]:
@@ -362,7 +372,7 @@ def tracks_over_frame(frames: Frames, tracks: Tracks) -> go.Figure:
     rows, cols = image.shape
     figure = go.Figure()
     figure.add_layout_image(
-        source=_png(image),
+        source=png(image),
         xref="x",
         yref="y",
         x=-0.5,
@@ -374,7 +384,7 @@ def tracks_over_frame(frames: Frames, tracks: Tracks) -> go.Figure:
         xanchor="left",
         yanchor="top",
     )
-    for m, method in enumerate(tracks.methods):
+    for m, method in _bottom_up(tracks.methods):
         x: list[float | None] = []
         y: list[float | None] = []
         for t in range(len(tracks.targets)):
@@ -434,9 +444,9 @@ def spectra(record: Spectra, references: tuple[str, ...], area: bool) -> go.Figu
                 line={"color": COLOURS["reference"], "width": 2, "dash": "dot"},
                 **at,
             )
-        for m, method in enumerate(record.methods):
+        for m, method in _bottom_up(record.methods):
             y, s = value[m, t], 1.96 * sigma[m, t]
-            if not np.isfinite(y).all() or method == "nominal":
+            if not np.isfinite(y).all() or method in FAR_OFF:
                 continue
             if method == "tracking":
                 figure.add_scatter(
@@ -463,7 +473,7 @@ def spectra(record: Spectra, references: tuple[str, ...], area: bool) -> go.Figu
         figure.update_yaxes(title="radiance [ref. unit]" if t % columns == 0 else None, **at)
     # The first target need not have every method: the legend is given its own traces.
     for method in record.methods:
-        if method != "nominal":
+        if method not in FAR_OFF:
             figure.add_scatter(
                 x=[None], y=[None], mode="lines", name=method, legendgroup=method, line=_stroke(method, 1.4)
             )
@@ -527,7 +537,7 @@ def bench(wavenumber: Array, spectrum: Array, reference: Array | None) -> go.Fig
     return layout(figure, 520)
 
 
-def _png(image: NDArray[np.uint8]) -> str:
+def png(image: NDArray[np.uint8]) -> str:
     done, data = cv2.imencode(".png", image)
     assert done
     return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode()

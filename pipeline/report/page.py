@@ -16,8 +16,8 @@ from plotly.offline import get_plotlyjs
 
 from pipeline.campaign import Campaign
 from pipeline.datasets import open_dataset
-from pipeline.records import Interferograms, Spectra, ThermalCorrection, Tracks, Trajectory
-from pipeline.report import figures
+from pipeline.records import LADDER, Interferograms, Spectra, ThermalCorrection, Tracks, Trajectory
+from pipeline.report import figures, maps
 
 
 class _Figures:
@@ -48,6 +48,7 @@ def write_report(
     template = environment.from_string(files("pipeline.report").joinpath("page.html").read_text(encoding="utf-8"))
     content = template.render(
         run=run,
+        ladder=[method for method in LADDER if method in run.get("rqe", {})],
         settings=json.dumps(settings, indent=1, sort_keys=True),
         warnings=warnings,
         plotly=Markup(get_plotlyjs()),
@@ -67,7 +68,10 @@ def _significant(value: Any, digits: int = 3) -> str:
     """A number for a table: `digits` significant ones, a dash for none."""
     if value is None:
         return "–"
-    return f"{value:.{digits}g}" if not (abs(value) >= 10**digits) else f"{value:.0f}"
+    if isinstance(value, int) or abs(value) >= 10**digits:
+        return f"{value:.0f}"
+    # Trailing zeros are kept, so that a column's numbers line up and say how well they are known.
+    return f"{value:#.{digits}g}".rstrip(".")
 
 
 def _thermal(out: Path, run: dict[str, Any], draw: _Figures) -> dict[str, Any] | None:
@@ -136,15 +140,16 @@ def _line(
         names = campaign.targets(flight, line).reference
         entry["figures"]["area"] = draw.html(figures.spectra(spectra, names, area=True))
         entry["figures"]["point"] = draw.html(figures.spectra(spectra, names, area=False))
-        interferometer = campaign.instrument.interferometer
-        assert interferometer is not None
-        opd = interferometer.opd((interferometer.rows - 1) / 2, np.arange(interferometer.cols))
+        with open_dataset(folder / "interferograms.nc") as d:
+            opd = d["opd"].values
         shown = int(np.argmax(record.seen[:, :, Tracks.CENTRE].sum(axis=0)))
         entry["figures"]["interferogram"] = draw.html(figures.interferogram(record, opd, shown))
         entry["interferogram_of"] = spectra.targets[shown]
         entry["targets"], entry["methods"] = spectra.targets, spectra.methods
-    if (folder / "quicklook.png").exists():
+    if scores.get("mapping") and (folder / "quicklook.png").exists():
         entry["quicklook"] = base64.b64encode((folder / "quicklook.png").read_bytes()).decode()
+        dem = campaign.path(campaign.keys.dem) if campaign.keys.dem is not None else None
+        entry["figures"]["map"] = draw.html(maps.over_terrain(folder / "cube.tif", dem, campaign.targets(flight, line)))
     return entry
 
 

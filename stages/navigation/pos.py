@@ -129,11 +129,9 @@ def smooth(
 
 def in_body_axes(imu: Imu, mounting: Mounting, correction: ThermalCorrection | None) -> Imu:
     """Compensated inertial data turned from the IMU's axes into the body's."""
-    gyro, accel = imu.gyro.copy(), imu.accel.copy()
     if correction is not None:
-        for i in range(3):
-            gyro[:, i] -= np.interp(imu.time, correction.time, correction.gyro[:, i])
-            accel[:, i] -= np.interp(imu.time, correction.time, correction.accel[:, i])
+        imu = correction.taken_off(imu)
+    gyro, accel = (np.ascontiguousarray(values) for values in (imu.gyro, imu.accel))
     if mounting.imu_to_body.any():
         turn = mounting.dcm_imu_to_body
         gyro, accel = np.ascontiguousarray(gyro @ turn.T), np.ascontiguousarray(accel @ turn.T)

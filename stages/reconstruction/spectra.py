@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from pipeline.errors import StageError
-from pipeline.records import Calibration, Frames, Interferograms, References, Spectra, Targets, Tracks
-from tsmftis import detector, extraction, fourier
+from pipeline.records import Calibration, Frames, Interferograms, Products, References, Spectra, Targets, Tracks
+from pipeline.usable_pixels import unusable
+from stages.reconstruction.interferograms import Extracted, Extraction, extract, gain_of
+from stages.reconstruction.panel import PanelPoints, fitted_blur, pair_noise, panel_points
+from stages.reconstruction.products import PhaseCorrection, imaginary_residue, panel_levels, panel_mean, spectra_by
+from tsmftis import detector, fourier
 from tsmftis.camera import Camera
+from tsmftis.effects import refuse_others
 from tsmftis.interferometer import Interferometer
 
 Array = NDArray[np.float64]
 
 LEAST_POINTS = 5  # of the 25, for an area to count
+LEAST_PAIRS = 6  # of points inside panels, for a noise model
 
 
 class ReconstructionSettings(BaseModel):
@@ -28,18 +36,67 @@ class ReconstructionSettings(BaseModel):
         1, ge=0, le=4, description="polynomial in OPD taken off each interferogram: 0 is the mean alone"
     )
     phase_order: int = Field(2, ge=1, le=6, description="polynomial order of the instrument's phase over wavenumber")
+    extraction: Extraction = Field(
+        "between-frames", description="or nearest-pixel: in each frame the pixel that a point lies in"
+    )
     block_frames: int = Field(256, ge=2, description="frames held in memory at a time")
+    product_apodization: str = Field(
+        "connes", description=f"window of products.nc, never scored: {', '.join(fourier.APODIZATIONS)}"
+    )
+    product_phase_correction: PhaseCorrection = Field("mertz", description="of products.nc: mertz or forman")
+    product_wavenumber_step_per_m: float = Field(5000.0, gt=0, description="of products.nc (zero filling, if fine)")
+
+    @field_validator("product_apodization")
+    @classmethod
+    def _known(cls, value: str) -> str:
+        if value not in fourier.APODIZATIONS:
+            raise ValueError(f"unknown apodization '{value}': use one of {', '.join(fourier.APODIZATIONS)}")
+        return value
 
 
 @dataclass(frozen=True)
 class ReconstructionResult:
-    """Spectra as scored, the interferograms behind them, phase coefficients and the noise model (read² [DN²], gain [DN])."""
+    """Spectra as scored, products, the interferograms behind them, phase coefficients, noise model (read² [DN²], gain [DN]).
+
+    bad_pixels: how many of the detector's were left out.
+    """
 
     spectra: Spectra
+    products: Products
     interferograms: Interferograms
     phase: Array
     read_variance: float
     gain: float
+    bad_pixels: int
+
+
+@dataclass(frozen=True)
+class _Line:
+    """What all spectra of a line share."""
+
+    calibration: Calibration
+    interferometer: Interferometer
+    settings: ReconstructionSettings
+    phase: Array  # coefficients
+    noise: tuple[float, float]  # read² [DN²], gain [DN]
+    scored: Array  # wavenumbers
+    rows: int
+    breaks: list[int]  # frames before which frames are missing
+    blur: float  # of the panels' edges [px]
+
+    def phase_at(self, wavenumber: Array) -> Array:
+        return fourier.smooth_phase(self.phase, wavenumber, (self.scored[0], self.scored[-1]))
+
+    @property
+    def centre(self) -> float:
+        """OPD [m] about which the fringes lie."""
+        return fourier.fringe_centre(self.phase_at(self.scored), self.scored)
+
+    def response_at(self, wavenumber: Array) -> Array:
+        return np.interp(wavenumber, self.calibration.wavenumber, self.calibration.response)
+
+    def variance(self, signal: Array) -> Array:
+        return self.noise[0] + self.noise[1] * np.maximum(signal, 0.0)
 
 
 def run(
@@ -51,38 +108,101 @@ def run(
     camera: Camera,
     interferometer: Interferometer,
     settings: ReconstructionSettings,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
 ) -> ReconstructionResult:
-    """Spectra of every target under every method.
+    """Spectra of every target under every method, and the products under the leading one: `tracking`, or the last.
 
-    The phase is the instrument's: it is estimated once, from the points of `tracking` (or the last method), and used for
-    all methods, so that the methods differ by geometry alone. Raises StageError where no point is seen well enough.
+    The phase is the instrument's: it is estimated once, from the points of the leading method, and used for all, so that the
+    methods differ by geometry alone. `effects` of the stage spectral are what a model update adds to interferometer and
+    calibration. Raises StageError where no point is seen well enough.
     """
-    ifg = extract(frames, tracks, calibration, camera, interferometer, settings)
-    wavenumber = interferometer.scored_wavenumbers()
-    response = np.interp(wavenumber, calibration.wavenumber, calibration.response)
+    refuse_others(effects or {}, "spectral")
+    interferometer, calibration = interferometer.with_effects(effects or {}), calibration.with_effects(effects or {})
+    bad = unusable(calibration, frames)
+    calibration = calibration.without(bad)
     leading = tracks.methods.index("tracking") if "tracking" in tracks.methods else len(tracks.methods) - 1
+    panels = [panel_points(r, c) for r, c in zip(tracks.row[leading], tracks.col[leading], strict=True)]
+    ifg, of_panels = _extract_all(frames, tracks, panels, calibration, camera, interferometer, settings)
+    wavenumber = interferometer.scored_wavenumbers()
     counted = ifg.seen >= fourier.LEAST_SEEN
     if not counted[leading].any():
-        raise StageError(
-            "no target crosses enough columns of the detector: the line is too short or the targets lie off its track"
-        )
+        raise StageError(_why_none(tracks.only(tracks.methods[leading]), camera))
     opd = ifg.opd(interferometer)
     ac = fourier.remove_constant(ifg.value, opd, settings.drift_order)
     phase = instrument_phase(
         ac[leading][counted[leading]], _of(opd, leading, counted), interferometer, wavenumber, settings.phase_order
     )
-    read_variance, gain = noise_model(ifg, ac, leading, counted, interferometer, calibration)
-    variance = read_variance + gain * np.maximum(ifg.value, 0.0)
+    blur = fitted_blur(panels, [panel_levels(extracted) for extracted in of_panels])
+    noise = noise_by_pairs(panels, of_panels, blur) or noise_model(
+        ifg, ac, leading, counted, interferometer, calibration
+    )
+    breaks = [start for start, _ in frames.segments()[1:]]
+    line = _Line(calibration, interferometer, settings, phase, noise, wavenumber, camera.rows, breaks, blur)
+    spectra = _scored(ifg, ac, opd, tracks, counted, references, targets, line)
+    products = _products(ifg, ac, opd, spectra, leading, panels, of_panels, references, targets, line)
+    return ReconstructionResult(spectra, products, ifg, phase, *noise, int(bad.sum()))
 
-    phi = fourier.smooth_phase(phase, wavenumber)
-    centre_opd = fourier.fringe_centre(phi, wavenumber)
-    window = fourier.scored_window(opd, interferometer.longest_opd, interferometer.shortest_side, centre_opd)
+
+def _why_none(tracks: Tracks, camera: Camera) -> str:
+    """Why no target was seen on enough columns: none crosses the detector, or their pixels are of no use."""
+    row, col = tracks.row[0, :, Tracks.CENTRE], tracks.col[0, :, Tracks.CENTRE]
+    inside = (row >= 0) & (row <= camera.rows - 1)
+    crossed = [np.ptp(np.clip(c[i], 0, camera.cols - 1)) if i.any() else 0.0 for c, i in zip(col, inside, strict=True)]
+    share = max(crossed) / (camera.cols - 1)
+    if share >= fourier.LEAST_SEEN:
+        return (
+            "targets cross the detector, but on more than 3 % of the columns their pixels are saturated or bad, or frames are "
+            "missing: no spectrum can be made of them"
+        )
+    return (
+        f"no target crosses enough columns of the detector (the best one {share:.0%}): the line is too short or the targets "
+        "lie off its track"
+    )
+
+
+def _extract_all(
+    frames: Frames,
+    tracks: Tracks,
+    panels: list[PanelPoints],
+    calibration: Calibration,
+    camera: Camera,
+    interferometer: Interferometer,
+    settings: ReconstructionSettings,
+) -> tuple[Interferograms, list[Extracted]]:
+    """Interferograms of the tracks' points and of the panels' in one pass over the frames."""
+    shape = tracks.row.shape[:3]
+    sizes = [int(np.prod(shape)), *(len(panel.row) for panel in panels)]
+    row, col = (
+        np.concatenate([getattr(tracks, n).reshape(sizes[0], -1), *(getattr(panel, n) for panel in panels)])
+        for n in ("row", "col")
+    )
+    every = extract(frames, row, col, calibration, camera, interferometer, settings.extraction, settings.block_frames)
+    edges = np.cumsum([0, *sizes])
+    parts = [every.part(start, stop) for start, stop in itertools.pairwise(edges)]
+    of_tracks = (getattr(parts[0], n).reshape(*shape, -1) for n in ("value", "gain", "row", "crossings"))
+    return Interferograms(tracks.methods, tracks.targets, *of_tracks), parts[1:]
+
+
+def _scored(
+    ifg: Interferograms,
+    ac: Array,
+    opd: Array,
+    tracks: Tracks,
+    counted: NDArray[np.bool_],
+    references: References | None,
+    targets: Targets,
+    line: _Line,
+) -> Spectra:
+    """The spectra that are scored: Connes window, Mertz ramp, of the centre and of the area."""
+    wavenumber, interferometer = line.scored, line.interferometer
+    phi, response = line.phase_at(wavenumber), line.response_at(wavenumber)
+    window = fourier.scored_window(opd, interferometer.longest_opd, interferometer.shortest_side, line.centre)
+    variance = line.variance(ifg.value)
     value, sigma = fourier.radiance(ac, opd, window, wavenumber, phi, response, variance * ifg.gain)
     value[~counted], sigma[~counted] = np.nan, np.nan
-    breaks = [start for start, _ in frames.segments()[1:]]
-    area, sigma_area = _area(ifg, tracks, breaks, value, variance, opd, window, wavenumber, phi, response)
+    area, sigma_area = _area(ifg, tracks, value, variance, opd, window, phi, response, line)
     centre = Tracks.CENTRE
-    spectra = Spectra(
+    return Spectra(
         tracks.methods,
         tracks.targets,
         wavenumber,
@@ -90,53 +210,93 @@ def run(
         sigma[:, :, centre],
         area,
         sigma_area,
-        scored_references(targets, references, calibration, interferometer, wavenumber),
+        references_as_seen(targets, references, line, fourier.SCORED_APODIZATION, wavenumber),
         counted.sum(axis=2),
-        phase,
+        line.phase,
         {
             "apodization": fourier.SCORED_APODIZATION,
             "phase_method": "Mertz, one polynomial for the line",
-            "drift_order": settings.drift_order,
-            "read_variance_dn2": read_variance,
-            "gain_dn": gain,
+            "drift_order": line.settings.drift_order,
+            "extraction": line.settings.extraction,
+            "read_variance_dn2": line.noise[0],
+            "gain_dn": line.noise[1],
         },
     )
-    return ReconstructionResult(spectra, ifg, phase, read_variance, gain)
 
 
-def extract(
-    frames: Frames,
-    tracks: Tracks,
-    calibration: Calibration,
-    camera: Camera,
-    interferometer: Interferometer,
-    settings: ReconstructionSettings,
-) -> Interferograms:
-    """Interferograms of all points (method, target, point, col), frames read in blocks that overlap by one within a run."""
-    shape = tracks.row.shape[:3]
-    row, col = (np.ascontiguousarray(a.reshape(-1, a.shape[-1])) for a in (tracks.row, tracks.col))
-    value, gain, weight, mean_row = (np.zeros((row.shape[0], camera.cols)) for _ in range(4))
-    blocks = [
-        (first, min(first + settings.block_frames + 1, stop))
-        for start, stop in frames.segments()
-        for first in range(start, stop - 1, settings.block_frames)
-    ]
-    for first, last in blocks:
-        counts = frames.block(first, last)
-        block = detector.correct(
-            counts, calibration.dark, calibration.flat, camera.saturation, interferometer.detector_nonlinearity
+def _products(
+    ifg: Interferograms,
+    ac: Array,
+    opd: Array,
+    spectra: Spectra,
+    leading: int,
+    panels: list[PanelPoints],
+    of_panels: list[Extracted],
+    references: References | None,
+    targets: Targets,
+    line: _Line,
+) -> Products:
+    """Under the leading method: the centre with the window and phase correction asked for, and the panel's best mean."""
+    settings, interferometer = line.settings, line.interferometer
+    wavenumber = interferometer.scored_wavenumbers(settings.product_wavenumber_step_per_m)
+    table = line.calibration.wavenumber
+    step = min(
+        settings.product_wavenumber_step_per_m, 0.2 / float(np.ptp(interferometer.opd(0, [0, interferometer.cols - 1])))
+    )
+    band = np.arange(table[0], table[-1], step)
+
+    def transform(ac: Array, variance: Array, opd: Array) -> tuple[Array, Array]:
+        return spectra_by(
+            ac,
+            variance,
+            opd,
+            interferometer,
+            wavenumber,
+            line.phase_at(wavenumber),
+            line.centre,
+            line.response_at(wavenumber),
+            settings.product_apodization,
+            settings.product_phase_correction,
+            band,
+            line.phase_at(band),
         )
-        extraction.along_tracks(block, first, row, col, value, gain, weight, mean_row)
-    seen = weight > 0
-    once = np.maximum(weight, 1.0)
-    filled = extraction.fill_gaps(value / once, seen)
-    return Interferograms(
-        tracks.methods,
-        tracks.targets,
-        filled.reshape(*shape, -1),
-        extraction.fill_gaps(gain / once**2, seen).reshape(*shape, -1),
-        extraction.fill_gaps(mean_row / once, seen).reshape(*shape, -1),
-        weight.reshape(*shape, -1),
+
+    centre = Tracks.CENTRE
+    at = opd if opd.ndim == 1 else opd[leading, :, centre]
+    variance = line.variance(ifg.value[leading, :, centre]) * ifg.gain[leading, :, centre]
+    value, sigma = transform(ac[leading, :, centre], variance, at)
+    seen = np.isfinite(spectra.radiance[leading, :, 0])
+    imaginary = imaginary_residue(
+        ac[leading, :, centre], variance, at, interferometer, line.scored, line.phase_at(line.scored)
+    )
+    value[~seen], sigma[~seen], imaginary[~seen] = np.nan, np.nan, np.nan
+    panel, sigma_panel = np.full((2, len(targets.ids), wavenumber.size), np.nan)
+    counts, contrast = np.zeros(len(targets.ids), np.int64), np.full(len(targets.ids), np.nan)
+    for t, (points, extracted) in enumerate(zip(panels, of_panels, strict=True)):
+        best = panel_mean(points, line.blur, extracted, line.noise, line.rows, line.breaks, settings.extraction)
+        if best is not None:
+            mean, spread, row, counts[t], contrast[t] = best
+            here = opd if opd.ndim == 1 else interferometer.opd(row, np.arange(interferometer.cols))[None]
+            panel_ac = fourier.remove_constant(mean[None], here, settings.drift_order)
+            panel[t], sigma_panel[t] = (a[0] for a in transform(panel_ac, spread[None], here))
+    return Products(
+        spectra.methods[leading],
+        targets.ids,
+        wavenumber,
+        value,
+        sigma,
+        panel,
+        sigma_panel,
+        references_as_seen(targets, references, line, settings.product_apodization, wavenumber),
+        counts,
+        imaginary,
+        contrast,
+        {
+            "apodization": settings.product_apodization,
+            "phase_correction": settings.product_phase_correction,
+            "extraction": settings.extraction,
+            "blur_px": line.blur,
+        },
     )
 
 
@@ -155,6 +315,13 @@ def instrument_phase(ac: Array, opd: Array, interferometer: Interferometer, wave
     return coefficients
 
 
+def noise_by_pairs(panels: list[PanelPoints], of_panels: list[Extracted], blur: float) -> tuple[float, float] | None:
+    """read² and gain from pairs of points inside the panels; None where there are hardly any."""
+    pairs = [pair_noise(panel, extracted, blur) for panel, extracted in zip(panels, of_panels, strict=True)]
+    signal, variance = (np.concatenate(values) for values in zip(*pairs, strict=True))
+    return detector.photon_transfer(signal, variance) if signal.size >= LEAST_PAIRS else None
+
+
 def noise_model(
     ifg: Interferograms,
     ac: Array,
@@ -163,7 +330,8 @@ def noise_model(
     interferometer: Interferometer,
     calibration: Calibration,
 ) -> tuple[float, float]:
-    """read² and gain from the out-of-band power of the leading method's points against their mean signal.
+    """read² and gain from the out-of-band power of the leading method's points against their mean signal: where there is no
+    panel to speak of. Texture of the scene that reaches out of band counts as noise.
 
     Out of band is where the response table ends, not where the declared range does: light goes on between the two.
     """
@@ -186,43 +354,38 @@ def _of(opd: Array, leading: int, counted: NDArray[np.bool_]) -> Array:
 def _area(
     ifg: Interferograms,
     tracks: Tracks,
-    breaks: list[int],
     value: Array,
     variance: Array,
     opd: Array,
     window: Array,
-    wavenumber: Array,
     phi: Array,
     response: Array,
+    line: _Line,
 ) -> tuple[Array, Array]:
     """Mean spectrum of each area's counted points (those whose `value` is finite) and its sigma, in which the noise of pixels
-    that several points share is counted once. breaks: frames before which frames are missing."""
+    that several points share is counted once."""
     counted = np.isfinite(value[..., 0])
     area, sigma = np.full_like(value[:, :, 0], np.nan), np.full_like(value[:, :, 0], np.nan)
-    rows = int(np.nanmax(tracks.row, initial=0.0)) + 2
     for m, t in zip(*np.nonzero(counted.sum(axis=2) >= LEAST_POINTS), strict=True):
         chosen = counted[m, t]
         area[m, t] = value[m, t, chosen].mean(axis=0)
-        gain = np.zeros(ifg.value.shape[-1])
-        row, col = (np.insert(track[m, t], breaks, np.nan, axis=1) for track in (tracks.row, tracks.col))
-        extraction.shared_gain(row, col, chosen, ifg.crossings[m, t], rows, gain)
+        share = chosen / chosen.sum()
+        how = line.settings.extraction
+        gain = gain_of(tracks.row[m, t], tracks.col[m, t], share, ifg.crossings[m, t], line.rows, line.breaks, how)
         at, w = (opd, window) if opd.ndim == 1 else (opd[m, t, chosen].mean(axis=0), window[m, t, chosen].mean(axis=0))
         mean_variance = variance[m, t, chosen].mean(axis=0) * gain
-        _, sigma[m, t] = fourier.radiance(mean_variance, at, w, wavenumber, phi, response, mean_variance)
+        _, sigma[m, t] = fourier.radiance(mean_variance, at, w, line.scored, phi, response, mean_variance)
     return area, sigma
 
 
-def scored_references(
-    targets: Targets,
-    references: References | None,
-    calibration: Calibration,
-    interferometer: Interferometer,
-    wavenumber: Array,
+def references_as_seen(
+    targets: Targets, references: References | None, line: _Line, apodization: str, wavenumber: Array
 ) -> Array:
-    """Each target's reference at the scored line shape (target, wavenumber); NaN where it has none."""
+    """Each target's reference at the line shape of a window (target, wavenumber); NaN where it has none."""
     out = np.full((len(targets.ids), wavenumber.size), np.nan)
     if references is None:
         return out
+    calibration = line.calibration
     for i, name in enumerate(targets.reference):
         if name:
             table = np.interp(
@@ -232,8 +395,8 @@ def scored_references(
                 table,
                 calibration.response,
                 calibration.wavenumber,
-                interferometer.longest_opd,
-                fourier.SCORED_APODIZATION,
+                line.interferometer.longest_opd,
+                apodization,
                 wavenumber,
             )
     return out

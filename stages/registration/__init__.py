@@ -1,5 +1,6 @@
-"""Registration: target tracks from the images alone, the baseline that POS tracking is held against."""
+"""Registration: target tracks by images, alone or with the POS's rotation: the ladder that POS tracking is held against."""
 
-from stages.registration.keyframes import RegistrationSettings, run
+from stages.registration.ladder import run
+from stages.registration.settings import RegistrationSettings
 
 __all__ = ["RegistrationSettings", "run"]

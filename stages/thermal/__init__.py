@@ -1,6 +1,7 @@
 """Thermal stage: chamber runs → a model of bias against temperature, verified on runs it has never seen.
 
 run(train, verify, settings) → ThermalResult;   result.model.correction(temperatures) → what to take off a flight
+verify_run(model, chamber, seconds) → what is left of one run;   verification_table(runs) → figures of several
 """
 
 from __future__ import annotations
@@ -17,16 +18,15 @@ from stages.thermal.model import ThermalModel
 from stages.thermal.settings import ThermalSettings
 from stages.thermal.training import fit_model
 from stages.thermal.verification import verification_table, verify_run
-from tsmftis.inertial import DEG_PER_H, MICRO_G
 
-__all__ = ["DEG_PER_H", "MICRO_G", "ThermalModel", "ThermalResult", "ThermalSettings", "run", "verify", "verify_run"]
+__all__ = ["ThermalModel", "ThermalResult", "ThermalSettings", "run", "verification_table", "verify_run"]
 
 
 @dataclass(frozen=True)
 class ThermalResult:
     """The model; the verification figures (empty without such runs); data for figures; what a reader must know.
 
-    `figures["verify"]`: one table a run (see `verify_run`); `figures["training"]`: N, M, α, β, γ, widths a channel.
+    `figures["verify"]`: one table a run (see `verify_run`); `figures["training"]`: N, M, α, β, γ, widths, constant a channel.
     """
 
     model: ThermalModel
@@ -35,8 +35,17 @@ class ThermalResult:
     notes: list[str]
 
 
-def run(train: Sequence[Chamber], verify: Sequence[Chamber], settings: ThermalSettings) -> ThermalResult:
-    """Train on the chamber runs `train`, and see on `verify` what is left."""
+def run(
+    train: Sequence[Chamber],
+    verify: Sequence[Chamber],
+    settings: ThermalSettings,
+    turn_on: tuple[float, float] | None = None,
+) -> ThermalResult:
+    """Train on the chamber runs `train`, and see on `verify` what is left.
+
+    `turn_on`: the declared sigmas of what gyros [rad/s] and accelerometers [m/s²] are off by from one start to the next; several
+    runs may differ by it, and a level far beyond it is warned of.
+    """
     if not train:
         raise InputError(
             "campaign.yaml",
@@ -46,11 +55,6 @@ def run(train: Sequence[Chamber], verify: Sequence[Chamber], settings: ThermalSe
         )
     if settings.device == "cuda" and not torch.cuda.is_available():
         raise InputError("settings", "thermal.device", "is 'cuda' where torch finds no such device", "set it to 'cpu'")
-    model, table, notes = fit_model(train, settings)
+    model, table, notes = fit_model(train, settings, turn_on)
     runs = [verify_run(model, chamber, settings.verification_block_s) for chamber in verify]
     return ThermalResult(model, verification_table(runs), {"training": table, "verify": runs}, notes)
-
-
-def verify(model: ThermalModel, runs: Sequence[Chamber], block_s: float) -> dict[str, dict[str, list[float]]]:
-    """Standard deviations of means over `block_s` [s] of what raw data and each method leave of runs: gyro [°/h], accel [µg]."""
-    return verification_table([verify_run(model, chamber, block_s) for chamber in runs])

@@ -4,6 +4,7 @@ Functions
 ---------
 smoothed            value and rate of a series by local straight lines of a given time constant
 channel_features    the features of the six channels
+refuse_endless      a record that a wrong stamp has made endless
 stuck_thermometers  channels of which a thermometer does not move while the unit's others do
 
 References
@@ -17,13 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
+from pipeline.errors import InputError
 from pipeline.records import Temperatures
+from stages.thermal.binning import binned_means
 
 Array = NDArray[np.float64]
 
 NAMES = ("T", "dT/dt", "Ta-Ts", "Tc-Ts")
 STEPS_PER_TIME_CONSTANT = 20
 CAUSAL_RIDGE = 0.02
+# A month in steps of 1.5 s: a longer record of few readings has a wrong stamp, and would ask for the memory of every step.
+MOST_STEPS = 2_000_000
 
 
 def smoothed(time: Array, values: Array, at: Array, smoothing_s: float, causal: bool = False) -> tuple[Array, Array]:
@@ -60,13 +65,23 @@ def smoothed(time: Array, values: Array, at: Array, smoothing_s: float, causal: 
     return _interpolate(at, grid, value) + rate_at * beyond[:, None], rate_at
 
 
+def refuse_endless(time: Array, smoothing_s: float, where: str) -> None:
+    """Raise InputError, about `where`, if the steps of the smoothing over times (m,) [s] are more than any record can need."""
+    step = max(smoothing_s / STEPS_PER_TIME_CONSTANT, float(np.median(np.diff(time))))
+    if time[-1] - time[0] > step * max(MOST_STEPS, 20 * len(time)):
+        before = int(np.argmax(np.diff(time)))
+        raise InputError(
+            where,
+            "times of the thermometers",
+            f"go from {time[before]:.6g} to {time[before + 1]:.6g} s from one reading to the next",
+            "remove readings with a wrong stamp, or make several runs of it",
+        )
+
+
 def _evenly(time: Array, values: Array, step: float) -> tuple[Array, Array]:
     """The series on even steps: bin means, set at the mean time of what fell into the bin, joined by straight lines."""
-    index = np.floor((time - time[0]) / step + 1e-9).astype(np.int64)
-    count = np.bincount(index)
-    filled = count > 0
-    mean_time = time[0] + np.bincount(index, weights=time - time[0])[filled] / count[filled]
-    means = np.stack([np.bincount(index, weights=v)[filled] / count[filled] for v in values.T], axis=1)
+    binned, _ = binned_means(time - time[0], np.column_stack([time - time[0], values]), step)
+    mean_time, means = time[0] + binned[:, 0], binned[:, 1:]
     grid = mean_time[0] + step * np.arange(int((mean_time[-1] - mean_time[0]) / step + 1e-9) + 1)
     return grid, _interpolate(grid, mean_time, means)
 
@@ -82,13 +97,14 @@ def _interpolate(at: Array, time: Array, values: Array) -> Array:
 
 
 def channel_features(
-    temperatures: Temperatures, at: Array, smoothing_s: float, causal: bool = False
+    temperatures: Temperatures, at: Array, smoothing_s: float, causal: bool = False, where: str = "readings"
 ) -> tuple[Array, ...]:
     """Features of the six channels at times (n,): gyro axes (n, 4) or (n, 2), accelerometer axes (n, 2).
 
     Gyro: T = mean of its thermometers, Ṫ, ∇T1 = Ta − Ts, ∇T2 = Tc − Ts (no gradients with one thermometer).
-    Accelerometer: T, Ṫ. [degC, K/s, K, K]
+    Accelerometer: T, Ṫ. [degC, K/s, K, K]  InputError, about `where`, if a wrong stamp makes the record endless.
     """
+    refuse_endless(temperatures.time, smoothing_s, where)
     gyro, accel = temperatures.gyro, temperatures.accel
     mean = np.column_stack([gyro.mean(axis=2), accel])
     value, rate = smoothed(temperatures.time, mean, at, smoothing_s, causal)

@@ -42,11 +42,12 @@ def alternatives(
     bounds: Array,
     count: int,
     seed: int,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, float]:
     """Up to `count` points (k, d) within bounds (d, 2) and their shares (k,), a sample of the density e^(−loss) about `mode`.
 
     `loss` is −ln(evidence·prior). Shares add up to 1; a point drawn more than once comes once with its share. The mode itself is
-    returned alone where no draw is worth counting.
+    returned alone where no draw is worth counting. The last is the effective size of the sample, (Σw)²/Σw² of the weights of all
+    draws: where it is small a few draws stand for the whole density, and the sample says little about its width.
     """
     rng = np.random.default_rng(seed)
     size = len(mode)
@@ -56,7 +57,7 @@ def alternatives(
     points = mode + (normal * sigma) @ vectors.T
     within = ((points >= bounds[:, 0]) & (points <= bounds[:, 1])).all(axis=1)
     if not within.any():
-        return mode[None], np.ones(1)
+        return mode[None], np.ones(1), 0.0
     points, normal = points[within], normal[within]
     log_density = -0.5 * (FREEDOM + size) * np.log1p((normal**2).sum(axis=1) / FREEDOM)
     log_weight = -np.array([loss(p) for p in points]) - log_density
@@ -64,4 +65,4 @@ def alternatives(
     edges = np.cumsum(weight) / weight.sum()
     chosen = np.searchsorted(edges, (np.arange(count) + 0.5) / count)
     chosen, times = np.unique(np.minimum(chosen, len(points) - 1), return_counts=True)
-    return points[chosen], times / count
+    return points[chosen], times / count, float(weight.sum() ** 2 / (weight**2).sum())

@@ -20,6 +20,11 @@ The noise of successive blocks may be correlated: with r_t = ρ·r_{t−1} + …
 is of the largest evidence too (weights integrated out, so this is restricted maximum likelihood): N in the evidence then
 counts information and not samples.
 
+Several runs differ by what a unit's bias changes from start to start: one offset a run is integrated out (`offsets.py`), its size
+τ relative to the noise, t, of the largest evidence with a weak prior about the declared turn-on bias, where that is known. A
+run without attitude has a free offset. Where no run has an attitude the level of the function means nothing: `origin`, the mean
+of the units over the training, is then taken off them, so that the mean correction there is 0 and sigma is that of a change.
+
 ℓ, ρ, α, β are not known exactly. The mean is that of the most probable ones; the variance is that of a sample of networks drawn
 by evidence (`hyperparameters.py`), about this mean: Σ_k p_k·(σ_k² + (δ_k − δ)²).
 
@@ -36,6 +41,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -45,6 +51,7 @@ from torch import Tensor
 
 from stages.thermal.evidence import Posterior, log_evidence, posterior, reestimate
 from stages.thermal.hyperparameters import alternatives
+from stages.thermal.offsets import Offsets
 
 Array = NDArray[np.float64]
 
@@ -54,6 +61,8 @@ JITTER = 1e-8
 # Gaussian ones, each within a factor of e².
 LOG_WIDTH_MEAN, LOG_WIDTH_SIGMA = math.log(3.0), 2.0
 LOG_RATIO_MEAN, LOG_RATIO_SIGMA = -2.0, 2.0
+# Offsets of runs: a tenth of the bias' own change within a factor of e², or the declared turn-on bias within a factor of e.
+LOG_OFFSET_MEAN, LOG_OFFSET_SIGMA, LOG_OFFSET_SIGMA_DECLARED = math.log(0.1), 2.0, 1.0
 # Linear units go on this far outside the envelope, in standard deviations of a feature.
 LINEAR_MARGIN = 1.0
 PREDICT_ROWS = 8192
@@ -67,7 +76,9 @@ class BayesianRbf:
     centres (m, D), low and high (D,), where the linear units stop, in scaled features. By network, the most probable one first:
     `share` p (K,), widths (K, D), `mixing` U (K, m, m); weights w (K, M); `factor` F (K, M, M) with F·Fᵀ = H⁻¹; α, β, γ,
     `ratio` ρ of the linear units, `correlation` of one block's noise with the next one's (K,). `constant` c and `scale` are in
-    the target's unit: all else is of (target − c)/scale. `count` is N.
+    the target's unit: all else is of (target − c)/scale. `count` is N. `origin` (K, M): what is taken off the
+    units, 0 where the level is known. `offsets` (R,): what each run of the training was off by, in the target's unit;
+    `offset_ratio` (K,): t. `effective`: how many independent draws the sample of networks is worth.
     """
 
     centres: Array
@@ -87,6 +98,34 @@ class BayesianRbf:
     scale: float
     count: int
     log_evidence: float
+    origin: Array
+    offsets: Array
+    offset_ratio: Array
+    effective: float
+
+    SHAPES: ClassVar[dict[str, tuple[str, ...]]] = {
+        "centres": ("m", "D"),
+        "low": ("D",),
+        "high": ("D",),
+        "share": ("K",),
+        "widths": ("K", "D"),
+        "mixing": ("K", "m", "m"),
+        "weights": ("K", "m+D"),
+        "factor": ("K", "m+D", "m+D"),
+        "alpha": ("K",),
+        "beta": ("K",),
+        "gamma": ("K",),
+        "ratio": ("K",),
+        "correlation": ("K",),
+        "constant": (),
+        "scale": (),
+        "count": (),
+        "log_evidence": (),
+        "origin": ("K", "m+D"),
+        "offsets": ("R",),
+        "offset_ratio": ("K",),
+        "effective": (),
+    }
 
     @property
     def noise_sigma(self) -> float:
@@ -128,7 +167,7 @@ class BayesianRbf:
             for k in range(len(self.share)):
                 square = np.tensordot(0.5 / self.widths[k] ** 2, apart, axes=1)
                 gaussian = np.exp(-square) @ self.mixing[k]
-                phi = np.hstack([gaussian, self.ratio[k] * held])
+                phi = np.hstack([gaussian, self.ratio[k] * held]) - self.origin[k]
                 unknown = np.maximum(1.0 - (gaussian**2).sum(axis=1), 0.0) + self.ratio[k] ** 2 * beyond
                 means[k, part] = phi @ self.weights[k]
                 variances[k, part] = ((phi @ self.factor[k]) ** 2).sum(axis=1) + unknown / (2.0 * self.alpha[k])
@@ -186,13 +225,27 @@ def whitened(values: Tensor, correlation: Tensor | float, starts: Tensor) -> Ten
 
 
 @dataclass(frozen=True)
+class _Made:
+    """One network: posterior of its weights, U, ln evidence, the units' origin (M,), the runs' offsets (R,)."""
+
+    posterior: Posterior
+    mixing: Array
+    evidence: float
+    origin: Array
+    offsets: Array
+
+
+@dataclass(frozen=True)
 class _Task:
-    """Features x (N, D) and scaled targets y (N,) as tensors, and where runs begin; p = (ln ℓ (D,), ln ρ, artanh of the noise's
-    correlation, ln α, ln β)."""
+    """Features x (N, D) and scaled targets y (N,) as tensors, where runs begin, and their offsets, whose ln τ is `expected`
+    within `within`; p = (ln ℓ (D,), ln ρ, ln t where offsets have a size, artanh of the noise's correlation, ln α, ln β)."""
 
     x: Tensor
     y: Tensor
     starts: Tensor
+    offsets: Offsets
+    expected: float
+    within: float
 
     @property
     def dimensions(self) -> int:
@@ -203,27 +256,51 @@ class _Task:
         """Prior variance between 1e-4 and 1e4 of the target's, noise between 1e-7 and 10: H stays well conditioned."""
         widths = [(math.log(0.05), math.log(100.0))] * self.dimensions
         noise = [(math.log(0.5e-4), math.log(0.5e4)), (math.log(0.05), math.log(0.5e7))]
-        return [*widths, (-6.0, 6.0), (0.0, 2.0), *noise]
+        size = [(math.log(0.01), math.log(1e5))] if self.offsets.finite else []
+        return [*widths, (-6.0, 6.0), *size, (0.0, 2.0), *noise]
+
+    def begin(self, first: float, others: float) -> Array:
+        """Where the search starts: widths of the first feature and of the others."""
+        log_beta = math.log(50.0)
+        size = [self.expected + 0.5 * (math.log(2.0) + log_beta)] if self.offsets.finite else []
+        widths = np.log([first] + [others] * (self.dimensions - 1))
+        return np.array([*widths, 0.0, *size, 0.1, math.log(2.0), log_beta])
 
     def tensor(self, a: Array) -> Tensor:
         return torch.as_tensor(a, dtype=torch.float64, device=self.x.device)
 
-    def whitened(self, q: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
-        """Design (N, M) and target (N,) freed of the noise's colour."""
+    def size(self, q: Tensor) -> Tensor:
+        """t, the offsets' size over the noise of a block."""
+        return q[self.dimensions + 1].exp() if self.offsets.finite else torch.ones_like(q[0])
+
+    def units(self, q: Tensor, centres: Tensor) -> Tensor:
+        """Φ (N, M)."""
         d = self.dimensions
-        design = torch.cat([_orthonormal(self.x, centres, q[:d]), q[d].exp() * self.x], dim=1)
-        correlation = q[-3].tanh()
-        return whitened(design, correlation, self.starts), whitened(self.y, correlation, self.starts)
+        return torch.cat([_orthonormal(self.x, centres, q[:d]), q[d].exp() * self.x], dim=1)
+
+    def white(self, values: Tensor, q: Tensor) -> Tensor:
+        """Rows (N, ...) freed of the noise's colour."""
+        return whitened(values, q[-3].tanh(), self.starts)
+
+    def whitened(self, q: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+        """Design (N', M) and target (N',) freed of the noise's colour and of the runs' offsets."""
+        ones, size = self.white(torch.ones_like(self.y), q), self.size(q)
+        design, target = self.white(self.units(q, centres), q), self.white(self.y[:, None], q)
+        return self.offsets.freed(design, ones, size), self.offsets.freed(target, ones, size)[:, 0]
 
     def volume(self, q: Tensor) -> Tensor:
         """ln of the determinant of the whitening, which the evidence of the whitened targets lacks."""
-        return -0.5 * (~self.starts).sum() * torch.log(1.0 - q[-3].tanh() ** 2)
+        colour = -0.5 * (~self.starts).sum() * torch.log(1.0 - q[-3].tanh() ** 2)
+        return colour + self.offsets.volume(self.white(torch.ones_like(self.y), q), self.size(q))
 
     def cost(self, q: Tensor, centres: Tensor) -> Tensor:
         """−ln evidence − ln prior."""
         d = self.dimensions
         prior = ((q[:d] - LOG_WIDTH_MEAN) / LOG_WIDTH_SIGMA).square().sum()
         prior = prior + ((q[d] - LOG_RATIO_MEAN) / LOG_RATIO_SIGMA).square()
+        if self.offsets.finite:
+            log_size = q[d + 1] - 0.5 * (math.log(2.0) + q[-1])
+            prior = prior + ((log_size - self.expected) / self.within).square()
         return 0.5 * prior - log_evidence(*self.whitened(q, centres), q[-2], q[-1]) - self.volume(q)
 
     def value(self, p: Array, centres: Tensor) -> float:
@@ -246,8 +323,8 @@ class _Task:
         )
         return float(fit.fun), np.asarray(fit.x)
 
-    def network(self, p: Array, centres: Tensor, settled: bool) -> tuple[Posterior, Array, float]:
-        """Weights at p, with α and β at their own maximum where `settled`; U; ln evidence."""
+    def network(self, p: Array, centres: Tensor, settled: bool) -> _Made:
+        """Weights at p, with α and β at their own maximum where `settled`, and all that goes with them."""
         q = self.tensor(p)
         design, target = self.whitened(q, centres)
         given = posterior(design, target, float(q[-2].exp()), float(q[-1].exp()))
@@ -258,7 +335,11 @@ class _Task:
         log_alpha, log_beta = (self.tensor(np.log(v)) for v in (found.alpha, found.beta))
         evidence = log_evidence(design, target, log_alpha, log_beta) + self.volume(q)
         mixing = torch.linalg.inv(_cholesky(centres, q[: self.dimensions])).T
-        return found, mixing.cpu().numpy(), float(evidence)
+        phi = self.units(q, centres)
+        origin = torch.zeros_like(phi[0]) if self.offsets.anchored else phi.mean(dim=0)
+        residual = self.white(self.y - phi @ found.weights, q)
+        offsets = self.offsets.estimated(residual, self.white(torch.ones_like(self.y), q), self.size(q))
+        return _Made(found, mixing.cpu().numpy(), float(evidence), origin.cpu().numpy(), offsets)
 
 
 def fit_network(
@@ -266,6 +347,8 @@ def fit_network(
     target: Array,
     *,
     starts: NDArray[np.bool_] | None = None,
+    offsets: Offsets | None = None,
+    turn_on: float | None = None,
     centres: tuple[int, ...] = (20, 40, 80),
     start_widths: tuple[tuple[float, float], ...] = ((0.5, 5.0), (2.0, 2.0)),
     iterations: int = 100,
@@ -274,21 +357,25 @@ def fit_network(
 ) -> BayesianRbf:
     """Train on scaled features (N, D) and targets (N,): widths, noise and its colour by evidence from each start, the best kept.
 
-    A start is a pair of widths: of the first feature (T) and of the others. `starts` (N,) marks the first block of each run; one
-    run where it is left out. The number of Gaussian units is the smallest of `centres` whose evidence is within a nat of the
-    best. `seed` is of the sample of hyperparameters.
+    A start is a pair of widths: of the first feature (T) and of the others. `starts` (N,) marks the first block of each stretch;
+    one stretch where it is left out. `offsets` tells runs whose levels differ (none where left out), by about `turn_on`, in the
+    target's unit, where that is known. The number of Gaussian units is the smallest of `centres` whose evidence is within a nat
+    of the best. `seed` is of the sample of hyperparameters.
     """
-    constant, scale = float(target.mean()), float(target.std()) or 1.0
     dimensions = features.shape[1]
     if starts is None:
         starts = np.arange(len(target)) == 0
+    if offsets is None:
+        offsets = Offsets((slice(0, len(target)),), (True,))
+    levels = [target[run] for run, known in zip(offsets.runs, offsets.known, strict=True) if known] or [target]
+    constant, scale = float(np.concatenate(levels).mean()), float(target.std()) or 1.0
+    expected, within = LOG_OFFSET_MEAN, LOG_OFFSET_SIGMA
+    if turn_on is not None:
+        expected, within = math.log(turn_on / scale), LOG_OFFSET_SIGMA_DECLARED
     with one_thread():
         x, y = (torch.as_tensor(a, dtype=torch.float64, device=device) for a in (features, (target - constant) / scale))
-        task = _Task(x, y, torch.as_tensor(starts, device=device))
-        begin = [
-            np.r_[np.log([first] + [others] * (dimensions - 1)), 0.0, 0.1, math.log(2.0), math.log(50.0)]
-            for first, others in start_widths
-        ]
+        task = _Task(x, y, torch.as_tensor(starts, device=device), offsets, expected, within)
+        begin = [task.begin(*widths) for widths in start_widths]
         fits: list[tuple[float, Array, Array]] = []
         for n in sorted({min(n, len(target)) for n in centres}):
             middle = features[spread_points(features, n)]
@@ -302,7 +389,7 @@ def fit_network(
         least = min(f[0] for f in fits)
         _, best, middle = next(f for f in fits if f[0] <= least + 1.0)
         c = task.tensor(middle)
-        others, share = alternatives(
+        others, share, effective = alternatives(
             lambda p: task.value(p, c),
             lambda p: task.slope(p, c)[1],
             best,
@@ -318,16 +405,20 @@ def fit_network(
         high=features.max(axis=0) + LINEAR_MARGIN,
         share=np.r_[0.0, share],
         widths=np.exp(points[:, :dimensions]),
-        mixing=np.stack([mixing for _, mixing, _ in made]),
-        weights=np.stack([p.weights.cpu().numpy() for p, _, _ in made]),
-        factor=np.stack([p.factor.cpu().numpy() for p, _, _ in made]),
-        alpha=np.array([p.alpha for p, _, _ in made]),
-        beta=np.array([p.beta for p, _, _ in made]),
-        gamma=np.array([p.gamma for p, _, _ in made]),
+        mixing=np.stack([m.mixing for m in made]),
+        weights=np.stack([m.posterior.weights.cpu().numpy() for m in made]),
+        factor=np.stack([m.posterior.factor.cpu().numpy() for m in made]),
+        alpha=np.array([m.posterior.alpha for m in made]),
+        beta=np.array([m.posterior.beta for m in made]),
+        gamma=np.array([m.posterior.gamma for m in made]),
         ratio=np.exp(points[:, dimensions]),
         correlation=np.tanh(points[:, -3]),
-        constant=constant,
+        constant=constant if offsets.anchored else 0.0,
         scale=scale,
         count=len(target),
-        log_evidence=made[0][2] - len(target) * math.log(scale),
+        log_evidence=made[0].evidence - len(target) * math.log(scale),
+        origin=np.stack([m.origin for m in made]),
+        offsets=scale * made[0].offsets,
+        offset_ratio=np.exp(points[:, dimensions + 1]) if offsets.finite else np.zeros(len(points)),
+        effective=effective,
     )

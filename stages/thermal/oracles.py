@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.linalg import solve_triangular
 
 from pipeline.errors import InputError
-from stages.thermal.baselines import rbf_design
+from stages.thermal.baselines import beyond, rbf_design
 
 Array = NDArray[np.float64]
 
@@ -40,6 +41,17 @@ class GaussianProcess:
     scale: float
     noise_sigma: float
 
+    SHAPES: ClassVar[dict[str, tuple[str, ...]]] = {
+        "points": ("N", "D"),
+        "widths": ("D",),
+        "amplitude": (),
+        "weights": ("N",),
+        "factor": ("N", "N"),
+        "constant": (),
+        "scale": (),
+        "noise_sigma": (),
+    }
+
     def predict(self, features: Array) -> tuple[Array, Array]:
         """Mean and standard deviation (n,) of the function at scaled features (n, D), in the target's unit."""
         square = ((features[:, None, :] / self.widths - self.points / self.widths) ** 2).sum(axis=2)
@@ -50,18 +62,37 @@ class GaussianProcess:
 
 @dataclass(frozen=True)
 class RidgeRbf:
-    """δ = φ(x)·w on a constant and Gaussian units of one width at fixed centres (M, D): weights (1 + M,), covariance of them."""
+    """δ = φ(x)·w on a constant and Gaussian units of one width at fixed centres (M, D): weights (1 + M,), covariance of them.
+
+    Its units fade outside the training data's range low … high (D,), and their variance with them: there the bias' standard
+    deviation `spread` is added for each standard deviation of distance.
+    """
 
     centres: Array
     width: float
     weights: Array
     covariance: Array
     noise_sigma: float
+    low: Array
+    high: Array
+    spread: float
+
+    SHAPES: ClassVar[dict[str, tuple[str, ...]]] = {
+        "centres": ("m", "D"),
+        "width": (),
+        "weights": ("1+m",),
+        "covariance": ("1+m", "1+m"),
+        "noise_sigma": (),
+        "low": ("D",),
+        "high": ("D",),
+        "spread": (),
+    }
 
     def predict(self, features: Array) -> tuple[Array, Array]:
         """Mean and standard deviation (n,) of the function at scaled features (n, D), in the target's unit."""
         phi = rbf_design(features, self.centres, self.width)
-        return phi @ self.weights, np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", phi, self.covariance, phi), 0.0))
+        variance = np.maximum(np.einsum("ni,ij,nj->n", phi, self.covariance, phi), 0.0)
+        return phi @ self.weights, np.sqrt(variance + (self.spread * beyond(features, self.low, self.high)) ** 2)
 
 
 def fit_gaussian_process(features: Array, target: Array, seed: int) -> GaussianProcess:
@@ -97,7 +128,9 @@ def fit_ridge(features: Array, target: Array, seed: int) -> RidgeRbf:
     )
     ridge.fit(design, target / scale)
     noise = scale / float(np.sqrt(ridge.alpha_))
-    return RidgeRbf(centres, RIDGE_WIDTH, scale * ridge.coef_, scale**2 * ridge.sigma_, noise)
+    low, high = features.min(axis=0), features.max(axis=0)
+    weights, covariance = scale * ridge.coef_, scale**2 * ridge.sigma_
+    return RidgeRbf(centres, RIDGE_WIDTH, weights, covariance, noise, low, high, float(target.std()))
 
 
 def _sklearn(part: str):  # type: ignore[no-untyped-def]

@@ -6,6 +6,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from pipeline.records import THERMAL_TIME_S
+
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 
@@ -20,7 +22,7 @@ class ThermalSettings(BaseModel):
 
     block_s: Positive = 60.0
     """Targets are means over this time: short against the thermal time constants, long against the noise."""
-    smoothing_s: Positive = 30.0
+    smoothing_s: Positive = THERMAL_TIME_S
     """Time constant of the smoothing and differentiation of the thermometers."""
     causal: bool = False
     """Smooth with the past alone (as a real-time system must) instead of with past and future; Ṫ then comes a time
@@ -32,11 +34,11 @@ class ThermalSettings(BaseModel):
     standard deviations of the features. The evidence often has two maxima: wavy in T and straight in the rest, or
     alike in all."""
     iterations: Count = 100
-    """Most steps of that search."""
+    """Most steps of the search from each start."""
     verification_block_s: Positive = 100.0
-    """The verification figures are standard deviations of means over this time."""
+    """The verification figures are standard deviations of means over this time, of which a run must have ten."""
     minimum_span_k: float = Field(default=2.0, ge=0.5)
-    """A chamber run in which a channel's temperature moves less teaches it nothing."""
+    """Chamber runs over all of which a channel's temperature spans less than this teach it nothing."""
     baselines: tuple[Literal["polynomial", "multi_polynomial", "rbf", "gaussian_process", "bayesian_ridge"], ...] = (
         "polynomial",
         "multi_polynomial",

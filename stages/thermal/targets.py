@@ -2,11 +2,10 @@
 
 Functions
 ---------
-bias_samples    gyro and accelerometer bias at every sample of a chamber run
-block_index     which block of time each sample belongs to, only full blocks counted
-block_means     means over these blocks
-thinned         a chamber run at a rate that suits temperatures
-refuse_motion   a chamber run must stand still and stand as its attitude says
+bias_samples      gyro and accelerometer bias at every sample of a chamber run
+expected_reading  what an ideal unit at rest reads
+thinned           a chamber run at a rate that suits temperatures
+refuse_motion     a chamber run must stand still and stand as its attitude says
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import InputError
 from pipeline.records import Chamber
+from stages.thermal.binning import binned_means, block_means
 from tsmftis.geodesy import earth_rate_ned, normal_gravity
 from tsmftis.rotation import rpy_to_dcm
 
@@ -52,26 +52,6 @@ def expected_reading(chamber: Chamber) -> Array:
     return np.concatenate([ned_to_imu @ earth_rate_ned(a.latitude), -ned_to_imu @ gravity])
 
 
-def block_index(time: Array, seconds: float, start: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Block ⌊(t − start)/seconds⌋ of each sample (n,), and the blocks that are well filled (b,).
-
-    A block with less than 90 % of the samples of the fullest one (the tail of the run, or a gap) is not among them: its
-    mean would be noisier than the others, and N counts blocks of equal noise.
-    """
-    # A stamp that should lie on the edge may miss it by rounding.
-    index = np.floor((time - start) / seconds + 1e-9).astype(np.int64)
-    count = np.bincount(index)
-    return index, np.flatnonzero(count >= max(1, round(0.9 * count.max())))
-
-
-def block_means(time: Array, values: Array, seconds: float) -> Array:
-    """Means of values (n, q) over the full blocks of `seconds` from the first stamp on, (b, q)."""
-    index, full = block_index(time, seconds, float(time[0]))
-    count = np.bincount(index)
-    sums = np.stack([np.bincount(index, weights=column) for column in values.T], axis=1)
-    return sums[full] / count[full, None]
-
-
 def thinned(chamber: Chamber, seconds: float, step: float) -> Chamber:
     """The run averaged into bins of about `step` that fill blocks of `seconds` evenly; as it is where it is no faster.
 
@@ -80,24 +60,13 @@ def thinned(chamber: Chamber, seconds: float, step: float) -> Chamber:
     step = seconds / np.ceil(seconds / step)
     if float(np.median(np.diff(chamber.time))) > 0.5 * step:
         return chamber
-    index, _ = block_index(chamber.time, step, float(chamber.time[0]))
-    count = np.bincount(index)
-
-    def mean(values: Array) -> Array:
-        flat = values.reshape(len(values), -1)
-        sums = np.stack([np.bincount(index, weights=column)[count > 0] for column in flat.T], axis=1)
-        return (sums / count[count > 0, None]).reshape(-1, *values.shape[1:])
-
     t = chamber.temperatures
-    time = mean(chamber.time)
-    return replace(
-        chamber,
-        time=time,
-        gyro=mean(chamber.gyro),
-        accel=mean(chamber.accel),
-        temperatures=replace(t, time=time, gyro=mean(t.gyro), accel=mean(t.accel)),
-        temperature_chamber=None,
+    time, gyro, accel, of_gyro, of_accel = (
+        binned_means(chamber.time, values, step)[0]
+        for values in (chamber.time, chamber.gyro, chamber.accel, t.gyro, t.accel)
     )
+    temperatures = replace(t, time=time, gyro=of_gyro, accel=of_accel)
+    return replace(chamber, time=time, gyro=gyro, accel=accel, temperatures=temperatures, temperature_chamber=None)
 
 
 def refuse_motion(chamber: Chamber, seconds: float) -> None:

@@ -1,11 +1,13 @@
 """Collinearity: trajectory, mounting and camera say on which row and column a ground point falls in each frame.
 
 p_camera = C_camera→ECEFᵀ·(P_point − P_camera), then the camera's projection. The pose is taken at the frame's true time,
-stamp − latency, by splines through the trajectory.
+stamp − latency, by splines through the trajectory. Effects of a model update change camera and mounting; a boresight that
+drifts is that of the frame's temperature, a mount that bends follows the unit's angular acceleration.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -14,15 +16,17 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.interpolate import CubicHermiteSpline
 
 from pipeline.errors import InputError, StageError
-from pipeline.records import DATA_GAP, CameraPoses, Targets, Tracks, Trajectory
+from pipeline.records import DATA_GAP, CameraPoses, Targets, Temperatures, Tracks, Trajectory
 from pipeline.truth import TruePoses
-from tsmftis.camera import Camera, Mounting, camera_pose
+from tsmftis.camera import Camera, Mounting, angular_acceleration, camera_pose
+from tsmftis.effects import refuse_others
 from tsmftis.geodesy import ecef_to_geodetic, geodetic_to_ecef, ned_to_ecef_dcm, radii_of_curvature
 from tsmftis.rotation import Attitude, dcm_to_rpy, rpy_to_dcm
 
 Array = NDArray[np.float64]
 
 MARGIN_S = 0.25  # trajectory kept beyond the line's ends, so that the splines have no end inside it
+FILTER_MARGIN_S = 2.0  # the same for a low pass of 12 Hz
 
 
 class TrackingSettings(BaseModel):
@@ -56,14 +60,21 @@ def run(
     mounting: Mounting,
     settings: TrackingSettings,
     truth: TruePoses | None = None,
+    temperatures: Temperatures | None = None,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
 ) -> TrackingResult:
     """Tracks of every point of every target through the frames with these time stamps [s]; by true poses too, if given.
 
-    Raises InputError where the frames lie outside the trajectory or a target lies nowhere near the line.
+    `effects` of the stage geometry are what a model update adds to camera and mounting; `temperatures` are the unit's, which a
+    boresight that drifts needs. Raises InputError where the frames lie outside the trajectory or a target lies nowhere near the
+    line, or where temperatures are needed and missing.
     """
+    refuse_others(effects or {}, "geometry")
+    camera, mounting = camera.with_effects(effects or {}), mounting.with_effects(effects or {})
     time = stamps - camera.latency
+    moved = Condition.at(time, trajectory, mounting, temperatures)
     events = poses_at(trajectory, time)
-    poses = camera_poses(events, mounting)
+    poses = camera_poses(events, mounting, moved)
     inside = np.isfinite(poses.centre[:, 0])
     if inside.sum() < 2:
         raise InputError(
@@ -72,6 +83,18 @@ def run(
             f"spans {time[0]:.2f} to {time[-1]:.2f} s but the trajectory {trajectory.time[0]:.2f} to "
             f"{trajectory.time[-1]:.2f} s: no frame lies inside it",
             "frames and IMU must share the campaign's one clock",
+        )
+    below = distance_down(target_points(targets, 0.0), poses)
+    if (np.nanmean(below, axis=1) <= 0.0).any():
+        i = int(np.argmin(np.nanmean(below, axis=1)))
+        raise StageError(
+            f"the camera flies {-np.nanmean(below[i]):.0f} m below target {targets.ids[i]}: heights of targets and trajectory "
+            "are not both above the ellipsoid"
+        )
+    towards = poses.centre[inside] / np.linalg.norm(poses.centre[inside], axis=1, keepdims=True)
+    if float(np.median(np.einsum("fi,fi->f", towards, poses.dcm[inside, :, 2]))) > -0.2:
+        raise StageError(
+            "the camera does not look down along the line: check mounting.boresight_deg and imu_to_body_deg"
         )
     course, speed = mean_course(trajectory, float(time[inside][0]), float(time[inside][-1]))
     points = target_points(targets, course)
@@ -88,9 +111,47 @@ def run(
     nominal = nominal_track(row, col, time, camera, speed, float(np.nanmean(distance_down(points, poses))))
     tracks = Tracks(("nominal", "tracking"), targets.ids, np.stack([nominal[0], row]), np.stack([nominal[1], col]))
     if truth is not None:
-        row, col = project(points, true_camera(time, truth, mounting), camera)
+        row, col = project(points, true_camera(time, truth, mounting, moved), camera)
         tracks = tracks.joined(Tracks(("true",), targets.ids, row[None], col[None]))
     return TrackingResult(tracks, poses, events, course, speed, float(np.nanmean(distance_down(points, poses))))
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What the mount is under in each frame: mean accelerometer temperature (n,) [degC], angular acceleration (n, 3) [rad/s²].
+
+    None where nothing depends on it.
+    """
+
+    temperature: Array | None = None
+    acceleration: Array | None = None
+
+    @classmethod
+    def at(
+        cls, time: Array, trajectory: Trajectory, mounting: Mounting, temperatures: Temperatures | None
+    ) -> Condition:
+        temperature = acceleration = None
+        if mounting.drift.any():
+            if temperatures is None:
+                raise InputError(
+                    "imu",
+                    "temperature_accel",
+                    "is missing, and boresight_thermal_drift turns the camera by it",
+                    "record temperatures, or leave that effect out of the model update",
+                )
+            temperature = np.interp(time, temperatures.time, temperatures.accel.mean(axis=1))
+        if mounting.flexure.any():
+            part = trajectory.between(time.min() - FILTER_MARGIN_S, time.max() + FILTER_MARGIN_S)
+            acceleration = np.zeros((time.size, 3))
+            if part.time.size > 1:
+                inside = (time >= part.time[0]) & (time <= part.time[-1])
+                acceleration[inside] = angular_acceleration(part.time, part.rate, time[inside])
+        return cls(temperature, acceleration)
+
+    def of(self, frames: NDArray[np.bool_]) -> Condition:
+        """That of some frames."""
+        chosen = (None if v is None else v[frames] for v in (self.temperature, self.acceleration))
+        return Condition(*chosen)
 
 
 def poses_at(trajectory: Trajectory, time: Array) -> Trajectory:
@@ -127,25 +188,30 @@ def poses_at(trajectory: Trajectory, time: Array) -> Trajectory:
     return Trajectory(**out)
 
 
-def camera_poses(events: Trajectory, mounting: Mounting) -> CameraPoses:
+def camera_poses(events: Trajectory, mounting: Mounting, under: Condition | None = None) -> CameraPoses:
     """The camera where the unit is at `events` (n,); NaN where that is not known."""
     centre, dcm = np.full((events.time.size, 3), np.nan), np.full((events.time.size, 3, 3), np.nan)
     known = np.isfinite(events.latitude)
+    now = (under or Condition()).of(known)
     centre[known], dcm[known] = camera_pose(
         events.latitude[known],
         events.longitude[known],
         events.height[known],
         rpy_to_dcm(*events.rpy[known].T),
         mounting,
+        now.temperature,
+        now.acceleration,
     )
     return CameraPoses(events.time, centre, dcm)
 
 
-def true_camera(time: Array, truth: TruePoses, mounting: Mounting) -> CameraPoses:
+def true_camera(time: Array, truth: TruePoses, mounting: Mounting, under: Condition | None = None) -> CameraPoses:
     """The camera as mounted on the unit at its true poses."""
     latitude, longitude, height = ecef_to_geodetic(truth.position)
     to_ned = np.swapaxes(ned_to_ecef_dcm(latitude, longitude), -1, -2)
-    return CameraPoses(time, *camera_pose(latitude, longitude, height, to_ned @ truth.dcm, mounting))
+    now = under or Condition()
+    pose = camera_pose(latitude, longitude, height, to_ned @ truth.dcm, mounting, now.temperature, now.acceleration)
+    return CameraPoses(time, *pose)
 
 
 def mean_course(trajectory: Trajectory, start: float, stop: float) -> tuple[float, float]:

@@ -295,8 +295,8 @@ CAMPAIGNS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     # calibration, references
     "calibration truncated": (truncated(CALIBRATION), ("calibration.nc", "truncated")),
     "flat of another size": (netcdf(CALIBRATION, lambda d: d.isel(row=slice(0, 40))), ("calibration.nc", "'dark'")),
-    "dead flat": (value(CALIBRATION, "flat", (0, 0), 0.0), ("calibration.nc", "'flat'", "pixels")),
-    "nan in dark": (value(CALIBRATION, "dark", (0, 0), np.nan), ("calibration.nc", "'dark'")),
+    "dead flat": (value(CALIBRATION, "flat", np.s_[:20], 0.0), ("calibration.nc", "'flat'", "pixels")),
+    "nan in dark": (value(CALIBRATION, "dark", np.s_[:20], np.nan), ("calibration.nc", "'dark'", "pixels")),
     "response of zero": (value(CALIBRATION, "response", 0, 0.0), ("calibration.nc", "'response'")),
     "response does not cover the range": (
         netcdf(CALIBRATION, lambda d: d.sel(wavenumber=slice(1.3e6, None))),
@@ -325,6 +325,23 @@ CAMPAIGNS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
         ("train.nc", "temperature"),
     ),
     "chamber in kelvin": (unit(TRAIN, "temperature_gyro", "K"), ("train.nc", "'temperature_gyro'", "degC")),
+    "chamber in kelvin that says degC": (
+        scaled(TRAIN, "temperature_accel", 1.0, 273.15),
+        ("train.nc", "'temperature_accel'", "kelvin"),
+    ),
+    "flight in kelvin that says degC": (
+        scaled(IMU, "temperature_gyro", 1.0, 273.15),
+        ("imu.nc", "'temperature_gyro'", "kelvin"),
+    ),
+    "thermometers on another clock": (
+        scaled(IMU, "time_temperature", 1.0, 1e6),
+        ("imu.nc", "'time_temperature'", "in common", "clock"),
+    ),
+    "thermometers for an eighth of the flight": (
+        netcdf(IMU, lambda d: d.isel(time_temperature=slice(0, d.time_temperature.size // 8))),
+        ("imu.nc", "'time_temperature'", "in common"),
+    ),
+    "chamber with a wild last stamp": (value(TRAIN, "time", -1, 1e13), ("train.nc", "times", "stamp")),
     "chamber with half an attitude": (
         netcdf(TRAIN, lambda d: d.attrs.__delitem__("yaw_deg")),
         ("train.nc", "yaw_deg", "missing"),

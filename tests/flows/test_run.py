@@ -26,7 +26,7 @@ from flows.settings import load_settings
 from flows.steps import STAGES, Plan
 from pipeline.errors import StageError
 
-METHODS = {"nominal", "registration", "tracking"}
+METHODS = {"nominal", "phase", "registration", "hybrid", "tracking"}
 EVERY = {"thermal@campaign", "navigation@F1"} | {
     f"{stage}@F1/{line}"
     for stage in ("tracking", "registration", "reconstruction", "mapping", "scoring")

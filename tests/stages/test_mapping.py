@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
-from rasterio.transform import Affine
 from rasterio.warp import transform as warp
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import StageError
-from pipeline.raster import open_cube, utm_crs
+from pipeline.raster import CubeGrid, from_crs, utm_crs, write_cube
 from pipeline.records import Calibration, CameraPoses, Frames, Targets, Tracks
 from stages.mapping import MappingSettings, line_grid, run
-from stages.mapping.cube import MapGrid
+from stages.mapping.grid import MapGrid
 from stages.reconstruction import ReconstructionSettings
 from stages.reconstruction import run as reconstruct
 from stages.tracking.collinearity import project, target_points
@@ -104,13 +103,93 @@ def test_a_cell_is_a_target_at_its_centre(tilt: float) -> None:
 
 
 def test_strips_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One row of cells at a time or all: the same frames are chosen for every cell that is seen (bit for bit)."""
+    """Five rows of cells at a time or all, three columns or all to a thread: rounding of float32 products of another shape."""
     grid = line_grid(poses(), CAMERA, GROUND, MappingSettings())
     sigma = interferometer(0.0).scored_wavenumbers(100_000.0)
     phase = np.full(sigma.size, 0.2)
     whole = cube(0.0, grid, sigma, phase)
-    monkeypatch.setattr("stages.mapping.cube.STRIP_VALUES", 1)
-    np.testing.assert_array_equal(cube(0.0, grid, sigma, phase), whole)
+    monkeypatch.setattr("stages.mapping.cube.STRIP_CELLS", 5)
+    monkeypatch.setattr("stages.mapping.cube.PIECE_CELLS", 3)
+    parts = cube(0.0, grid, sigma, phase)
+    np.testing.assert_array_equal(np.isnan(parts), np.isnan(whole))
+    np.testing.assert_allclose(parts, whole, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(cube(0.0, grid, sigma, phase), parts)  # and the same bytes when run again
+
+
+def written(grid: MapGrid, radiance: np.ndarray, sigma: np.ndarray, folder: Path) -> dict[str, Path]:
+    """The cube's files, in strips of 50 rows."""
+    names = {
+        "cube": "cube.tif",
+        "quicklook": "q.png",
+        "location": "location.tif",
+        "envi": "cube.img",
+        "envi_header": "cube.hdr",
+    }
+    files = {n: folder / name for n, name in names.items()}
+    strips = [(i, radiance[i : i + 50]) for i in range(0, grid.shape[0], 50)]
+    about = CubeGrid(grid.crs, grid.affine, grid.shape, sigma, 1.0e4)
+    seen = write_cube(about, strips, lambda start, stop: grid.places(start, stop, flat), files)
+    assert seen == pytest.approx(np.isfinite(radiance[..., 0]).mean())
+    return files
+
+
+def test_all_files_of_a_cube_say_the_same(tmp_path: Path) -> None:
+    """GeoTIFF, its overviews, the ENVI file as GDAL reads it, and the location array against PROJ point by point (1 mm)."""
+    grid = line_grid(poses(), CAMERA, GROUND, MappingSettings(cell_m=0.06))
+    sigma = interferometer(0.0).scored_wavenumbers(200_000.0)
+    rng = np.random.default_rng(3)
+    radiance = rng.uniform(1.0, 2.0, (*grid.shape, sigma.size)).astype(np.float32)
+    radiance[:7] = np.nan
+    files = written(grid, radiance, sigma, tmp_path)
+    with (
+        rasterio.open(files["cube"]) as tif,
+        rasterio.open(files["envi"]) as envi,
+        rasterio.open(files["location"]) as where,
+    ):
+        np.testing.assert_array_equal(np.moveaxis(tif.read(), 0, -1), radiance)
+        np.testing.assert_array_equal(envi.read(), tif.read())
+        assert envi.crs == tif.crs == where.crs and np.isnan(envi.nodata)
+        np.testing.assert_allclose(envi.transform, tif.transform, atol=1e-3)
+        tags = tif.tags(1)
+        assert float(tags["wavelength"]) == pytest.approx(1e9 / sigma[0]) and tags["wavelength_units"] == "nm"
+        assert float(tags["fwhm"]) == pytest.approx(1e9 / sigma[0] ** 2 * 1e4, rel=1e-6)
+        assert tif.overviews(1) and tif.profile["tiled"]
+        # An overview's cell is the mean of the four that were seen; the first rows were not.
+        with rasterio.open(files["cube"], overview_level=0) as overview:
+            half = overview.read(1)
+        np.testing.assert_allclose(half[20, 20], radiance[40:42, 40:42, 0].mean(), atol=0.3)  # GDAL's cells need not be ours
+        np.testing.assert_allclose(np.nanmean(half), np.nanmean(radiance[..., 0]), atol=1e-3)
+        assert np.isnan(half[1, 5])
+        latitude, longitude, height = where.read()
+    assert grid.shape[0] * grid.shape[1] > 4096  # large enough for the lattice
+    x, y = grid.centres(0, grid.shape[0])
+    some = rng.integers(0, x.size, 50)
+    lon, lat = warp(grid.crs, "EPSG:4326", x.ravel()[some], y.ravel()[some])
+    np.testing.assert_allclose(latitude.ravel()[some], lat, atol=1e-8)
+    np.testing.assert_allclose(longitude.ravel()[some], lon, atol=1e-8)
+    assert (height == GROUND).all()
+    header = files["envi_header"].read_text()
+    for key in (
+        "samples",
+        "lines",
+        "bands",
+        "interleave = bil",
+        "data type = 4",
+        "byte order = 0",
+        "map info",
+        "wavelength = {",
+    ):
+        assert key in header
+    assert f"{1e9 / sigma[-1]:.4f}" in header and "fwhm = {" in header and "data ignore value = nan" in header
+
+
+def test_coordinates_over_a_large_grid_are_those_point_by_point() -> None:
+    """Kilometres of cells of 20 m, 5° off the zone's meridian: a fraction of 1e-4 of a cell."""
+    x, y = np.meshgrid(300_000.0 + 20.0 * np.arange(300), 4_100_000.0 + 20.0 * np.arange(200))
+    latitude, longitude = from_crs("EPSG:32652", x, y)
+    lon, lat = warp("EPSG:32652", "EPSG:4326", x[::37, ::41].ravel(), y[::37, ::41].ravel())
+    np.testing.assert_allclose(np.rad2deg(latitude)[::37, ::41].ravel(), lat, atol=2e-7)
+    np.testing.assert_allclose(np.rad2deg(longitude)[::37, ::41].ravel(), lon, atol=2e-7)
 
 
 def test_a_panel_lies_where_it_was_surveyed(tmp_path: Path) -> None:
@@ -119,10 +198,8 @@ def test_a_panel_lies_where_it_was_surveyed(tmp_path: Path) -> None:
     assert grid.cell == pytest.approx(15e-6 * 1000.0 / 0.07, rel=1e-3)
     sigma = interferometer(0.0).scored_wavenumbers(100_000.0)
     radiance = cube(0.0, grid, sigma, np.full(sigma.size, 0.2))
-    path = tmp_path / "cube.tif"
-    with open_cube(path, grid.crs, Affine(*grid.affine), grid.shape, 1e9 / sigma) as target:
-        target.write(np.moveaxis(radiance, 2, 0))
-    with rasterio.open(path) as source:
+    files = written(grid, radiance, sigma, tmp_path)
+    with rasterio.open(files["cube"]) as source:
         image = source.read().mean(axis=0)
         transform, crs = source.transform, source.crs
         assert source.descriptions[0] == f"{1e9 / sigma[0]:.3f} nm" and np.isnan(source.nodata)
