@@ -59,7 +59,9 @@ def _effect(path: Path, name: Any, given: Any, applied: frozenset[str]) -> dict[
         if key in effect.lists:
             three = given.get(key, [0.0, 0.0, 0.0])
             if not isinstance(three, list) or len(three) != 3:
-                raise InputError(path, where, f"is {three!r}", f"give a list of three, one an axis [{effect.units[key]}]")
+                raise InputError(
+                    path, where, f"is {three!r}", f"give a list of three, one an axis [{effect.units[key]}]"
+                )
             values[key] = tuple(_number(path, where, value, effect, key) for value in three)
         else:
             values[key] = _number(path, where, given.get(key, 0.0), effect, key)

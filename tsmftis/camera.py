@@ -167,6 +167,6 @@ def angular_acceleration(time: Array, rate: Array, at: Array) -> Array:
     step = float(np.median(np.diff(time)))
     even = time[0] + step * np.arange(int(np.ceil((time[-1] - time[0]) / step - 1e-6)) + 1)
     smooth = np.stack([np.interp(even, time, axis) for axis in rate.T], -1)
-    if FLEXURE_CUTOFF < 0.5 / step:
+    if 0.5 / step > FLEXURE_CUTOFF:
         smooth = sosfiltfilt(butter(2, FLEXURE_CUTOFF, fs=1.0 / step, output="sos"), smooth, axis=0)
     return np.asarray(make_interp_spline(even - 0.5 * step, smooth).derivative()(at))

@@ -14,7 +14,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-Effects = Mapping[str, Mapping[str, float]]  # by name and parameter; those that are lists of three are in EFFECTS[…].lists
+Effects = Mapping[
+    str, Mapping[str, float]
+]  # by name and parameter; those that are lists of three are in EFFECTS[…].lists
 
 
 @dataclass(frozen=True)

@@ -132,9 +132,7 @@ class BenchResult:
         return xr.Dataset(variables, {"wavenumber": (("wavenumber",), self.wavenumber, {"units": "m-1"})}, attributes)
 
 
-def run(
-    bench: Bench, settings: BenchSettings, effects: Mapping[str, Mapping[str, float]] | None = None
-) -> BenchResult:
+def run(bench: Bench, settings: BenchSettings, effects: Mapping[str, Mapping[str, float]] | None = None) -> BenchResult:
     """The spectrum of `bench` on the reference's wavenumbers or, without one, from 0 to the Nyquist wavenumber.
 
     Of the `effects` of the stage spectral detector_nonlinearity, opd_scale and opd_quadratic concern a bench instrument.

@@ -157,7 +157,9 @@ def test_all_files_of_a_cube_say_the_same(tmp_path: Path) -> None:
         # An overview's cell is the mean of the four that were seen; the first rows were not.
         with rasterio.open(files["cube"], overview_level=0) as overview:
             half = overview.read(1)
-        np.testing.assert_allclose(half[20, 20], radiance[40:42, 40:42, 0].mean(), atol=0.3)  # GDAL's cells need not be ours
+        np.testing.assert_allclose(
+            half[20, 20], radiance[40:42, 40:42, 0].mean(), atol=0.3
+        )  # GDAL's cells need not be ours
         np.testing.assert_allclose(np.nanmean(half), np.nanmean(radiance[..., 0]), atol=1e-3)
         assert np.isnan(half[1, 5])
         latitude, longitude, height = where.read()
