@@ -152,7 +152,7 @@ def test_a_model_update_reprocesses_with_the_effect(copied: Path, tmp_path: Path
         ({"gnss_latency": {"delay": 1.0}}, {}, ("effects.gnss_latency.delay", "no parameter", "latency")),
         ({"gnss_latency": {"latency": "soon"}}, {}, ("effects.gnss_latency.latency", "'soon'", "[s]")),
         ({"gnss_latency": 0.04}, {}, ("effects.gnss_latency", "holds no parameters")),
-        ({"camera_latency": {"latency": 0.007}}, {}, ("effects.camera_latency", "takes no update yet")),
+        ({"thermal_lag": {"lag": 30.0}}, {}, ("effects.thermal_lag", "takes no update yet")),
         (["gnss_latency"], {}, ("effects", "holds no keys")),
         ({}, {"format": "other"}, ("format", "tsmftis-model-update/1")),
         ({}, {"colour": 1}, ("colour", "not known")),
