@@ -33,7 +33,7 @@ from tsmftis import __version__
 from tsmftis.effects import EFFECTS
 from tsmftis.fourier import SCORED_APODIZATION, line_width, rqe, smooth_phase
 
-UPDATED = frozenset({"navigation", "geometry", "spectral"})  # stages whose models take a model update
+UPDATED = frozenset({"thermal", "navigation", "geometry", "spectral"})  # stages whose models take a model update
 
 # Each stage and the stages whose results it reads, in the order in which a reader should meet them.
 NEEDS: Mapping[str, tuple[str, ...]] = {
@@ -115,7 +115,7 @@ def thermal_step(plan: Plan) -> StageRecord:
 
     def work(to: Paths) -> dict[str, Any]:
         train, verify = ([campaign.chamber(n) for n in part] for part in (keys.train, keys.verify))
-        result = thermal.run(train, verify, plan.settings.thermal, turn_on)
+        result = thermal.run(train, verify, plan.settings.thermal, turn_on, plan.effects("thermal"))
         write_dataset(result.model.to_dataset(), to["model"])
         write_json(to["figures"], _plain(result.figures))
         return {"verify": result.verification, "notes": list(result.notes)}
@@ -130,6 +130,7 @@ def thermal_step(plan: Plan) -> StageRecord:
             "train": list(keys.train),
             "verify": list(keys.verify),
             "turn_on": _plain(turn_on),
+            "effects": plan.effects("thermal"),
         },
         {n: campaign.path(n) for n in names},
         {"model": "thermal_model.nc", "figures": "thermal_figures.json"},
@@ -222,7 +223,7 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
     campaign = plan.opened
     entry, instrument = campaign.line(flight, line), campaign.instrument
     trajectory = plan.out / flight / "trajectory.nc"
-    effects = plan.effects("geometry")
+    effects = _of_camera(plan)
     inputs = {
         "trajectory": _needed(trajectory, "navigation"),
         "frames": campaign.path(entry.frames),
@@ -300,7 +301,7 @@ def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
             CameraPoses.from_file(inputs["poses"]),
             camera,
             plan.settings.registration,
-            plan.effects("geometry"),
+            _of_camera(plan),
         )
         write_dataset(tracks.joined(followed).to_dataset(), to["tracks"])
         return dict(followed.notes)
@@ -312,7 +313,7 @@ def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
         ("stages.registration",),
         {
             "settings": _plain(plan.settings.registration),
-            "effects": plan.effects("geometry"),
+            "effects": _of_camera(plan),
             "camera": _plain(camera),
         },
         inputs,
@@ -535,6 +536,11 @@ def _needed(path: Path, stage: str) -> Path:
     if not path.exists():
         raise InputError(path, "file", "is not there", f"run stage {stage} first: `--from {stage}` or no stage option")
     return path
+
+
+def _of_camera(plan: Plan) -> Effects:
+    """Effects on camera and mounting: those of the geometry but the terrain's."""
+    return {name: values for name, values in plan.effects("geometry").items() if name != "dem_bias"}
 
 
 def _can_be_compensated(campaign: Campaign, flight: str) -> bool:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 Effects = Mapping[
     str, Mapping[str, float]
@@ -79,7 +80,7 @@ def amounts(effects: Effects, name: str) -> tuple[float, ...]:
     return tuple(given.get(key, 0.0) for key in EFFECTS[name].units)
 
 
-def refuse_others(effects: Effects, *stages: str) -> None:
+def refuse_others(effects: Mapping[str, Mapping[str, Any]], *stages: str) -> None:
     """Raise ValueError where a name is no effect on these stages' models, or has no such parameter."""
     for name, values in effects.items():
         known = EFFECTS.get(name)

@@ -6,7 +6,7 @@ verify_run(model, chamber, seconds) → what is left of one run;   verification_
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ import torch
 
 from pipeline.errors import InputError
 from pipeline.records import Chamber
+from stages.thermal.memory import Memory
 from stages.thermal.model import ThermalModel
 from stages.thermal.settings import ThermalSettings
 from stages.thermal.training import fit_model
@@ -40,11 +41,13 @@ def run(
     verify: Sequence[Chamber],
     settings: ThermalSettings,
     turn_on: tuple[float, float] | None = None,
+    effects: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> ThermalResult:
     """Train on the chamber runs `train`, and see on `verify` what is left.
 
     `turn_on`: the declared sigmas of what gyros [rad/s] and accelerometers [m/s²] are off by from one start to the next; several
-    runs may differ by it, and a level far beyond it is warned of.
+    runs may differ by it, and a level far beyond it is warned of. `effects` of the stage thermal are what a model update adds;
+    the model keeps them for every flight that it is applied to.
     """
     if not train:
         raise InputError(
@@ -55,6 +58,6 @@ def run(
         )
     if settings.device == "cuda" and not torch.cuda.is_available():
         raise InputError("settings", "thermal.device", "is 'cuda' where torch finds no such device", "set it to 'cpu'")
-    model, table, notes = fit_model(train, settings, turn_on)
+    model, table, notes = fit_model(train, settings, turn_on, Memory.of(effects or {}))
     runs = [verify_run(model, chamber, settings.verification_block_s) for chamber in verify]
     return ThermalResult(model, verification_table(runs), {"training": table, "verify": runs}, notes)

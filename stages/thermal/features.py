@@ -97,16 +97,22 @@ def _interpolate(at: Array, time: Array, values: Array) -> Array:
 
 
 def channel_features(
-    temperatures: Temperatures, at: Array, smoothing_s: float, causal: bool = False, where: str = "readings"
+    temperatures: Temperatures,
+    at: Array,
+    smoothing_s: float,
+    causal: bool = False,
+    where: str = "readings",
+    felt: Array | None = None,
 ) -> tuple[Array, ...]:
     """Features of the six channels at times (n,): gyro axes (n, 4) or (n, 2), accelerometer axes (n, 2).
 
     Gyro: T = mean of its thermometers, Ṫ, ∇T1 = Ta − Ts, ∇T2 = Tc − Ts (no gradients with one thermometer).
-    Accelerometer: T, Ṫ. [degC, K/s, K, K]  InputError, about `where`, if a wrong stamp makes the record endless.
+    Accelerometer: T, Ṫ. [degC, K/s, K, K]  `felt` (m, 6) stands for T at the readings where it is not their own mean.
+    InputError, about `where`, if a wrong stamp makes the record endless.
     """
     refuse_endless(temperatures.time, smoothing_s, where)
     gyro, accel = temperatures.gyro, temperatures.accel
-    mean = np.column_stack([gyro.mean(axis=2), accel])
+    mean = np.column_stack([gyro.mean(axis=2), accel]) if felt is None else felt
     value, rate = smoothed(temperatures.time, mean, at, smoothing_s, causal)
     features = [np.column_stack([value[:, i], rate[:, i]]) for i in range(6)]
     if gyro.shape[2] == 3:

@@ -28,6 +28,7 @@ from stages.thermal.features import (
     refuse_endless,
     stuck_thermometers,
 )
+from stages.thermal.memory import Memory
 from stages.thermal.network import BayesianRbf
 from stages.thermal.oracles import GaussianProcess, RidgeRbf
 from stages.thermal.targets import CHANNELS
@@ -97,7 +98,8 @@ class ThermalModel:
     """Six channels in the order gyro x, y, z, accelerometer x, y, z, and how their features are made of readings.
 
     `thermometers`: how many a gyro had in the chamber (3 or 1). `doubts`: what whoever applies the model must know about its
-    training. `source`: what an error about the model names.
+    training. `memory`: what a model update adds, known to the fit and to every correction. `source`: what an error about the
+    model names.
     """
 
     channels: tuple[ChannelModel, ...]
@@ -107,6 +109,7 @@ class ThermalModel:
     minimum_span_k: float
     thermometers: int
     doubts: tuple[str, ...] = ()
+    memory: Memory = field(default_factory=Memory)
     source: str = field(default="thermal model", compare=False)
 
     @property
@@ -125,7 +128,12 @@ class ThermalModel:
                 f"are of {names[count]} a gyro where {self.source} was trained with {names[self.thermometers]}",
                 "apply it to readings of the same thermometers, or train on a chamber run with these",
             )
-        return channel_features(temperatures, at, self.smoothing_s, self.causal, str(where))
+        felt = self.memory.felt(temperatures)
+        return channel_features(temperatures, at, self.smoothing_s, self.causal, str(where), felt)
+
+    def remembered(self, temperatures: Temperatures, at: Array) -> Array:
+        """The part of the six channels' biases (n, 6) at times (n,) that hangs on what temperatures were before."""
+        return self.memory.bias(temperatures, at, self.smoothing_s, self.causal)
 
     def correction(
         self,
@@ -165,7 +173,8 @@ class ThermalModel:
         if gaps:
             # The last reading, and the first after a gap, are readings; the ends of the inertial data are not.
             missing |= (time < readings[0]) | (time > readings[-1])
-        features = self.features(temperatures, np.clip(time, readings[0], readings[-1]), where)
+        at = np.clip(time, readings[0], readings[-1])
+        features, remembered = self.features(temperatures, at, where), self.remembered(temperatures, at)
         stuck = stuck_thermometers(temperatures, self.minimum_span_k)
         bias, sigma, distance = (np.zeros((len(time), 6)) for _ in range(3))
         for i, (channel, of_channel) in enumerate(zip(self.channels, features, strict=True)):
@@ -173,6 +182,7 @@ class ThermalModel:
                 bias[:, i], sigma[:, i] = channel.untouched(len(time))
                 continue
             bias[:, i], sigma[:, i] = channel.predict(of_channel, method)
+            bias[:, i] += remembered[:, i]
             distance[:, i] = channel.distance(of_channel)
             sigma[missing, i] = np.maximum(sigma[missing, i], channel.prior_sigma)
         seconds = float(sum(stop - start for start, stop in gaps))
@@ -208,6 +218,10 @@ class ThermalModel:
                 "thermometers": self.thermometers,
                 "methods": " ".join(self.methods),
                 "doubts": "\n".join(self.doubts),
+                "hysteresis_half_width_k": self.memory.half_width,
+                "hysteresis_gyro_rad_per_s": list(self.memory.gyro),
+                "hysteresis_accel_m_per_s2": list(self.memory.accel),
+                "lag_s": self.memory.lag,
             },
         )
 
@@ -240,6 +254,7 @@ class ThermalModel:
             file.attribute("minimum_span_k", positive=True),
             thermometers,
             tuple(str(file.attributes.get("doubts", "")).splitlines()),
+            file.memory(),
             str(path),
         )
 
@@ -266,6 +281,23 @@ class _File:
         if not np.isfinite(value) or (positive and value <= 0.0):
             raise self.spoiled(f"attribute '{name}'", f"is {self.attributes[name]!r}")
         return value
+
+    def memory(self) -> Memory:
+        """What is missing is none, as in files from before there were model updates."""
+        names = ("hysteresis_half_width_k", "hysteresis_gyro_rad_per_s", "hysteresis_accel_m_per_s2", "lag_s")
+        none = (0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+        half_width, gyro, accel, lag = (self.attributes.get(n, d) for n, d in zip(names, none, strict=True))
+        effects = {
+            "thermal_hysteresis": {"half_width": half_width, "gyro": gyro, "accel": accel},
+            "thermal_lag": {"lag": lag},
+        }
+        try:
+            memory = Memory.of(effects)
+        except (TypeError, ValueError) as error:
+            raise self.spoiled(f"attributes {', '.join(names)}", f"are no hysteresis and lag ({error})") from None
+        if not np.isfinite([memory.half_width, *memory.gyro, *memory.accel, memory.lag]).all():
+            raise self.spoiled(f"attributes {', '.join(names)}", "are not finite")
+        return memory
 
     def array(self, name: str) -> Array:
         """A variable of finite numbers."""

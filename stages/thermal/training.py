@@ -13,6 +13,7 @@ from pipeline.records import Chamber
 from stages.thermal.baselines import Free, fit_multi_polynomial, fit_polynomial, fit_traditional_rbf
 from stages.thermal.binning import block_means
 from stages.thermal.features import STEPS_PER_TIME_CONSTANT, channel_features, stuck_thermometers
+from stages.thermal.memory import Memory
 from stages.thermal.model import ChannelModel, Predictor, ThermalModel
 from stages.thermal.network import BayesianRbf, fit_network
 from stages.thermal.offsets import Offsets
@@ -52,8 +53,9 @@ class TrainingSet:
         return np.diff(self.run, prepend=-1) > 0
 
 
-def training_set(train: Sequence[Chamber], settings: ThermalSettings) -> TrainingSet:
-    """Block means of bias and features, the runs one after the other."""
+def training_set(train: Sequence[Chamber], settings: ThermalSettings, memory: Memory | None = None) -> TrainingSet:
+    """Block means of bias and features, the runs one after the other; what the unit's `memory` makes is no part of them."""
+    memory = memory or Memory()
     bias: list[Array] = []
     features: list[list[Array]] = [[] for _ in CHANNELS]
     refused = [""] * 6
@@ -61,9 +63,13 @@ def training_set(train: Sequence[Chamber], settings: ThermalSettings) -> Trainin
     thermometers = _thermometers(train)
     for chamber in (thinned(c, settings.block_s, step) for c in train):
         refuse_motion(chamber, settings.block_s)
-        bias.append(block_means(chamber.time, bias_samples(chamber), settings.block_s))
+        remembered = memory.bias(chamber.temperatures, chamber.time, settings.smoothing_s, settings.causal)
+        if chamber.attitude is None:
+            remembered = remembered - remembered.mean(axis=0)  # as the samples are
+        bias.append(block_means(chamber.time, bias_samples(chamber) - remembered, settings.block_s))
         where = f"chamber run {chamber.name}"
-        made = channel_features(chamber.temperatures, chamber.time, settings.smoothing_s, settings.causal, where)
+        felt = memory.felt(chamber.temperatures)
+        made = channel_features(chamber.temperatures, chamber.time, settings.smoothing_s, settings.causal, where, felt)
         for i, f in enumerate(made):
             features[i].append(block_means(chamber.time, f, settings.block_s))
         for i, label in enumerate(stuck_thermometers(chamber.temperatures, settings.minimum_span_k)):
@@ -166,13 +172,18 @@ def _predictors(
 
 
 def fit_model(
-    train: Sequence[Chamber], settings: ThermalSettings, turn_on: tuple[float, float] | None = None
+    train: Sequence[Chamber],
+    settings: ThermalSettings,
+    turn_on: tuple[float, float] | None = None,
+    memory: Memory | None = None,
 ) -> tuple[ThermalModel, list[dict[str, object]], list[str]]:
     """The model, a table of what each network learnt, and notes on what could not be learnt or is hard to believe.
 
-    `turn_on`: the declared sigmas of what gyros [rad/s] and accelerometers [m/s²] are off by from one start to the next.
+    `turn_on`: the declared sigmas of what gyros [rad/s] and accelerometers [m/s²] are off by from one start to the next;
+    `memory`: what a model update adds.
     """
-    data = training_set(train, settings)
+    memory = memory or Memory()
+    data = training_set(train, settings, memory)
     known = np.array([c.attitude is not None for c in train])
     offsets = Offsets.of(data.run, known) if len(train) > 1 or not known.any() else None
     declared = [None] * 6 if turn_on is None else np.repeat(turn_on, 3).tolist()
@@ -191,6 +202,7 @@ def fit_model(
         settings.minimum_span_k,
         data.thermometers,
         tuple(doubts),
+        memory,
     )
     table: list[dict[str, object]] = []
     notes = [

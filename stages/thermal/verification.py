@@ -52,13 +52,14 @@ def verify_run(model: ThermalModel, chamber: Chamber, seconds: float) -> dict[st
         for name, channel, label in zip(CHANNELS, model.channels, stuck, strict=True)
         if channel.refused or label
     }
+    remembered = model.remembered(chamber.temperatures, chamber.time) * [name not in why for name in CHANNELS]
     left, sigma, noise = {}, np.empty_like(raw), np.zeros(6)
     for method in model.methods or ("bayesian_rbf",):
         predicted = [
             c.untouched(len(f)) if name in why else c.predict(f, method)
             for name, c, f in zip(CHANNELS, model.channels, features, strict=True)
         ]
-        left[method] = raw - means(np.column_stack([mean for mean, _ in predicted]))
+        left[method] = raw - means(remembered + np.column_stack([mean for mean, _ in predicted]))
         if method == "bayesian_rbf":
             for i, channel in enumerate(model.channels):
                 network = channel.predictors.get(method)

@@ -14,7 +14,9 @@ import pytest
 import xarray as xr
 import yaml
 
+from pipeline.errors import InputError
 from pipeline.formats import sbet, smrmsg
+from pipeline.model_update import read_model_update
 from pipeline.records import Trajectory
 
 SHARED = Path(os.environ.get("TSMFTIS_SHARED", Path(__file__).parents[2].parent / "shared")) / "data" / "sbet"
@@ -145,6 +147,40 @@ def test_a_model_update_reprocesses_with_the_effect(copied: Path, tmp_path: Path
     assert content["provenance"]["model_update"] == {"gnss_latency": {"latency": 0.03}}
 
 
+def test_a_model_update_reaches_every_stage_that_it_concerns(demo: Path, tmp_path: Path, tsmftis: Any) -> None:
+    """One effect of each stage, one line; later less of them: what does not hang on the change is not done again."""
+    out, line = tmp_path / "out", ("--line", "L01")
+    effects = {
+        "thermal_hysteresis": {"half_width": 4.0, "gyro": [1e-7, -1e-7, 0.0]},
+        "camera_latency": {"latency": 1e-3},
+        "boresight_thermal_drift": {"pitch": 1e-5},
+        "fringe_tilt": {"tilt": 1e-9},
+        "dem_bias": {"height": 3.0},
+    }
+    answer = tsmftis("run", demo, "--out", out, *line, "--model-update", update(tmp_path, effects))
+    assert answer.code == 0, answer.err
+    content = json.loads((out / "run.json").read_text())["provenance"]["model_update"]
+    assert content["thermal_hysteresis"] == {"half_width": 4.0, "gyro": [1e-7, -1e-7, 0.0], "accel": [0.0, 0.0, 0.0]}
+    assert "half_width 4.00" in (out / "report.html").read_text()
+    answer = tsmftis("run", demo, "--out", out, *line, "--model-update", update(tmp_path, effects | {"dem_bias": {}}))
+    assert answer.code == 0 and "ran 1 of" in answer.out
+    effects["dem_bias"] = {}
+    less = {k: v for k, v in effects.items() if k != "fringe_tilt"}
+    answer = tsmftis("run", demo, "--out", out, *line, "--model-update", update(tmp_path, less))
+    done = {row.split()[0] for row in answer.out.splitlines() if row.endswith(" s")}
+    assert answer.code == 0 and done == {"reconstruction", "scoring", "mapping"}, answer.out
+    with xr.open_dataset(out / "F1" / "L01" / "poses.nc", engine="h5netcdf", decode_times=False) as d:
+        np.testing.assert_allclose(np.diff(d["time"].values), 0.01, atol=1e-9)
+        stamps = xr.open_dataset(demo / "F1" / "L01.nc", engine="h5netcdf", decode_times=False)["time"].values
+        np.testing.assert_allclose(stamps - d["time"].values, 1e-3, atol=1e-9)
+
+
+def test_a_stage_may_refuse_updates(tmp_path: Path) -> None:
+    path = update(tmp_path, {"camera_latency": {"latency": 0.007}})
+    with pytest.raises(InputError, match="takes no update yet"):
+        read_model_update(path, frozenset({"navigation"}))
+
+
 @pytest.mark.parametrize(
     ("effects", "more", "parts"),
     [
@@ -152,7 +188,15 @@ def test_a_model_update_reprocesses_with_the_effect(copied: Path, tmp_path: Path
         ({"gnss_latency": {"delay": 1.0}}, {}, ("effects.gnss_latency.delay", "no parameter", "latency")),
         ({"gnss_latency": {"latency": "soon"}}, {}, ("effects.gnss_latency.latency", "'soon'", "[s]")),
         ({"gnss_latency": 0.04}, {}, ("effects.gnss_latency", "holds no parameters")),
-        ({"thermal_lag": {"lag": 30.0}}, {}, ("effects.thermal_lag", "takes no update yet")),
+        ({"camera_latency": {"latency": 7.0}}, {}, ("effects.camera_latency.latency", "more than 5 s")),
+        ({"thermal_hysteresis": {"half_width": 5.0, "gyro": 1e-7}}, {}, ("thermal_hysteresis.gyro", "list of three")),
+        (
+            {"thermal_hysteresis": {"half_width": 5.0, "gyro": [1e-7, 0.0, True]}},
+            {},
+            ("thermal_hysteresis.gyro", "[rad s-1]"),
+        ),
+        ({"thermal_hysteresis": {"gyro": [1e-7, 0.0, 0.0]}}, {}, ("thermal_hysteresis.half_width", "less than 0.01 K")),
+        ({"thermal_lag": {"lag": -3}}, {}, ("thermal_lag.lag", "less than 0 s")),
         (["gnss_latency"], {}, ("effects", "holds no keys")),
         ({}, {"format": "other"}, ("format", "tsmftis-model-update/1")),
         ({}, {"colour": 1}, ("colour", "not known")),

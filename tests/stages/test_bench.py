@@ -56,6 +56,37 @@ def test_gaussian_line_is_found_as_it_is(correction: str, phase: float) -> None:
     assert result.wavenumber[0] == 0.0 and result.wavenumber[-1] == pytest.approx(0.5 / STEP)
 
 
+@pytest.mark.parametrize("a", [0.04, -0.05])
+@pytest.mark.parametrize("phase", [0.0, 2.9])
+def test_detector_nonlinearity_is_taken_out(a: float, phase: float) -> None:
+    """s' = s·(1 − a·s), s relative to its own largest deviation, whichever sign that has; any gain and offset in counts."""
+    x = axis()
+    s = gaussian(x, phase) - 7.0
+    s = (s - s.mean()) / np.abs(s - s.mean()).max()
+    settings = DENSITY.model_copy(update={"apodization": "connes"})
+    true = run(bench(300.0 * s, x), settings).spectrum
+    recorded = bench(300.0 * s * (1.0 - a * s) + 1234.0, x)
+    update = {"detector_nonlinearity": {"a": a}}
+    assert fourier.rqe(run(recorded, settings, update).spectrum, true) < 1e-6
+    assert fourier.rqe(run(recorded, settings).spectrum, true) > 1e-3
+
+
+def test_opd_effects_stretch_the_axis() -> None:
+    """A scan on a stretched and bent OPD that its file does not know: the line is back where it is."""
+    x = axis()
+    middle = np.arange(x.size) - x.size // 2
+    true = 1.01 * x + 2e-10 * middle**2
+    update = {"opd_scale": {"scale": 0.01}, "opd_quadratic": {"quadratic": 2e-10}}
+    wavenumber = np.linspace(2.5e5, 5.5e5, 301)
+    told = Bench(gaussian(true)[None], x, wavenumber, gaussian_line(wavenumber))
+    assert run(told, DENSITY, update).relative_rms < 1e-2  # type: ignore[operator]
+    assert run(told, DENSITY).relative_rms > 0.05  # type: ignore[operator]
+    with pytest.raises(InputError, match="opd_quadratic"):
+        run(told, DENSITY, {"opd_quadratic": {"quadratic": 1e-8}})
+    with pytest.raises(ValueError, match="camera_latency"):
+        run(told, DENSITY, {"camera_latency": {"latency": 0.1}})
+
+
 def test_lorentzian_line() -> None:
     """B(σ) = (γ/π)/((σ−σ0)² + γ²): exp(−2πγ|x|)·cos(2πσ0x), cut where it has fallen to 5e-4."""
     x, gamma = axis(), 3e3

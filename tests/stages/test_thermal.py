@@ -476,7 +476,7 @@ def test_a_channel_that_takes_nothing_off_is_at_no_distance(train: Chamber, tmp_
     "method", ["polynomial", "multi_polynomial", "rbf", "gaussian_process", "bayesian_ridge", "bayesian_rbf"]
 )
 def test_sigma_of_every_method_is_of_the_function_and_grows_outside(method: str) -> None:
-    """Over six draws of the noise: errors of the mean are between .3 and 1.6 sigma where the method can follow the law (a line),
+    """Over six draws of the noise: errors of the mean are as large as sigma says where the method can follow the law (a line),
     and sigma far below the noise of 1; outside the training data it grows with the distance."""
     x = np.column_stack([np.linspace(-1.7, 1.7, 100), np.cos(9.0 * np.linspace(-1.7, 1.7, 100))])
     law = 3.0 * x[:, 0] + 1.0
@@ -490,9 +490,16 @@ def test_sigma_of_every_method_is_of_the_function_and_grows_outside(method: str)
         assert np.median(sigma) < 0.6
         far = [channel.predict(np.array([[t, 0.0]]), method)[1][0] for t in (1.7, 2.5, 4.0)]
         assert far[0] < far[1] < far[2] * 1.001 and far[2] > 2.0 * far[0]
-    # Over 60 draws the RMS is 1.6 for scikit-learn's ridge, whose sigma is taken as it is; rbf's bumps cannot follow a line.
-    if method != "rbf":
-        assert 0.3 < np.sqrt(np.mean(np.square(ratio))) < (2.0 if method == "bayesian_ridge" else 1.6)
+    # Of 60 draws the RMS of error over sigma is 1.0 for both polynomials, and 1.6 for scikit-learn's ridge, whose sigma is taken
+    # as it is. Six draws, of about fifteen independent errors, give these within a quarter. Bumps cannot follow a line.
+    bounds = {
+        "rbf": (0.0, np.inf),
+        "bayesian_ridge": (0.3, 2.0),
+        "gaussian_process": (0.3, 1.6),
+        "bayesian_rbf": (0.3, 1.6),
+    }
+    low, high = bounds.get(method, (0.7, 1.4))
+    assert low < np.sqrt(np.mean(np.square(ratio))) < high
 
 
 def test_a_small_sample_of_hyperparameters_is_told(train: Chamber, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,114 @@
+"""What a stage offers the closed loop: its residual as a function of named effects, and what is needed to judge it.
+
+    r(θ) = data − model(θ) = N·β + S·θ_missing + e,        S = −∂r/∂θ
+
+N are columns that the stage's own model can take up (its nuisance parameters, linearised), β their unknown values, θ the
+parameters of candidate effects, all zero in the declared model, and e noise: white, or white and a Gauss–Markov process.
+
+Classes
+-------
+Parameter        one parameter of a candidate: its unit, what is believed of it, the step of its differences
+Candidate        an effect that the declared model may lack
+ResidualProblem  the residual with its nuisance, candidates, covariates, groups and noise blocks
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+Parameters = Mapping[str, Mapping[str, float]]
+"""Effect → parameter → value; what is not named is zero."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """`largest`, `smallest`: the physical bounds (default: −largest); `plausible`: a size worth naming, which the data must be
+    able to show at all (default: largest); `step` of the central differences (default: plausible/1000)."""
+
+    unit: str
+    largest: float
+    smallest: float | None = None
+    plausible: float | None = None
+    step: float | None = None
+
+    @property
+    def low(self) -> float:
+        return -self.largest if self.smallest is None else self.smallest
+
+    @property
+    def size(self) -> float:
+        return self.largest if self.plausible is None else self.plausible
+
+    @property
+    def difference(self) -> float:
+        return 1e-3 * self.size if self.step is None else self.step
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect with its parameters; null at zero.
+
+    grid: values of the parameters that the residual is not linear in, each entry one start and one test of its own. Where the
+    residual there is that of the null (the width of a play whose amplitude is zero), the other parameters are differentiated
+    there; where it is not (a lag), the secant from the null to there is the signature.
+    """
+
+    effect: str
+    parameters: Mapping[str, Parameter]
+    grid: tuple[Mapping[str, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class ResidualProblem:
+    """A stage's residual (n,), ordered in series of growing time.
+
+    residual    parameters → (n,); every sample of a channel has the same white noise
+    group       (n,) what is held out together (branch, minute, line, band); labels of a sample
+    series      (n,) samples of different series share no noise; each is one stretch of the ordered samples
+    time        (n,) coordinate of the coloured noise, strictly growing within a series
+    nuisance    (n, p) columns N of what the stage's own model takes up; those that are zero outside one group are that group's
+                own, and are fitted there when it is held out
+    channel     (n,) samples of one channel share their noise's variances (default: all of them)
+    covariates  name → (n,): what the remainder may depend on if no candidate accounts for it
+    sigma       the white noise's standard deviation where it is known (1 for whitened innovations): more than it is structure
+    floor       RMS of the residual that is the method's own accuracy: below it nothing is looked for
+    unit        of the residual, for a reader
+    """
+
+    stage: str
+    residual: Callable[[Parameters], Array]
+    candidates: tuple[Candidate, ...]
+    group: Labels
+    series: Labels
+    time: Array
+    nuisance: Array
+    channel: Labels | None = None
+    covariates: Mapping[str, Array] = field(default_factory=dict)
+    sigma: float | None = None
+    floor: float = 0.0
+    unit: str = "1"
+    group_names: Mapping[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = self.group.size
+        for name in ("series", "time", "nuisance", "channel"):
+            value = getattr(self, name)
+            if value is not None and len(value) != n:
+                raise ValueError(f"{self.stage}: {name} has {len(value)} samples, group has {n}")
+        for name, covariate in self.covariates.items():
+            if covariate.shape != (n,):
+                raise ValueError(f"{self.stage}: covariate {name} has shape {covariate.shape}, not ({n},)")
+        same = np.diff(self.series) == 0
+        if (np.diff(self.time)[same] <= 0).any():
+            raise ValueError(f"{self.stage}: time does not grow within a series")
+        if 1 + np.count_nonzero(~same) != np.unique(self.series).size:
+            raise ValueError(f"{self.stage}: a series is not one stretch of samples")
+        names = [c.effect for c in self.candidates]
+        if len(set(names)) != len(names):
+            raise ValueError(f"{self.stage}: a candidate is named twice: {', '.join(names)}")

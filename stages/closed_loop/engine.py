@@ -1,0 +1,559 @@
+"""The loop itself: test, confirm, add, estimate all together, repeat; then what covariates say; then one look at a sealed group.
+
+    1 signatures  2 what can be told at all  3 the largest statistic in coloured noise  4 held-out groups and negative controls
+    5 joint estimate, signatures anew, drop what is no longer needed, repeat  6 splines of covariates for what is left
+
+A name is refused where a covariate explains the same data so much better that nothing is left for it: then the covariate is
+reported (`learned:<covariate>`), never the name that fits a little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from pipeline.residual_problem import Candidate, ResidualProblem
+from stages.closed_loop import confirmation, identifiability, learned
+from stages.closed_loop.confirmation import Confirmation, Model
+from stages.closed_loop.estimation import Estimate, estimate
+from stages.closed_loop.noise import Layout, Noise, fit_noise, gram
+from stages.closed_loop.result import LoopResult, Sealed, Step, Value, Verdict
+from stages.closed_loop.score_test import Finding, project, search, solve, spans, statistic
+from stages.closed_loop.separation import would_separate
+from stages.closed_loop.settings import LoopSettings
+from stages.closed_loop.signatures import Member, Values, members, merged
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+SEALED_FROM = 4  # groups
+CERTAIN = 1e-3  # family-wise p of structure that is there, though nothing accounts for it
+UNNEEDED = 0.05  # p of an effect beside others
+COVARIATE_WINS = 0.01
+CHANGES = 0.1  # of an effect's χ²
+EXCESS = 1.1  # RMS over a known sigma that is structure
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why something that stands out is not added, and whether it shows structure all the same."""
+
+    why: str
+    structure: bool
+
+
+@dataclass
+class State:
+    """Where the loop stands: nuisance with learned columns (n, p); effects' values, r (n,) and S (n, q) there; the steps."""
+
+    nuisance: Array
+    residual: Array
+    estimate: Estimate | None = None
+    steps: list[Step] = field(default_factory=list)
+    blocked: set[str] = field(default_factory=set)
+    dropped: set[str] = field(default_factory=set)
+    notes: list[str] = field(default_factory=list)
+    certain: list[str] = field(default_factory=list)
+    noise: Noise | None = None
+
+    @property
+    def values(self) -> Values:
+        return {} if self.estimate is None else self.estimate.values
+
+    @property
+    def columns(self) -> Array:
+        """Nuisance and the signatures of what was added."""
+        return self.nuisance if self.estimate is None else np.column_stack([self.nuisance, self.estimate.signatures])
+
+
+def run(problem: ResidualProblem, settings: LoopSettings, seed: int) -> LoopResult:
+    """What `problem`'s model lacks. The same problem, settings and seed give the same answer."""
+    rng = np.random.default_rng(seed)
+    rows, sealed = _seal(problem, settings, rng)
+    layout = Layout.of(problem, rows)
+    null = np.asarray(problem.residual({}), float)
+    if null.shape != problem.group.shape or not np.isfinite(null[rows]).all():
+        raise ValueError(f"{problem.stage}: the residual has shape {null.shape} or is not finite")
+    state = State(np.asarray(problem.nuisance, float), null)
+    candidates = {c.effect: c for c in problem.candidates}
+    state.noise = fit_noise(layout, state.nuisance[rows], null[rows])
+    limits = _limits(problem, layout, state, candidates, settings)
+    while len(state.steps) < settings.steps:
+        if _rms(problem, layout, state) <= problem.floor:
+            state.notes.append(
+                f"the residual is within the method's own accuracy, {problem.floor:.2g} {problem.unit} RMS"
+            )
+            break
+        if _named_step(problem, layout, state, candidates, settings, rng):
+            continue
+        if not _learned_step(problem, layout, state, settings, rng):
+            break
+        state.blocked.clear()
+        if state.estimate is not None:
+            e = state.estimate
+            state.estimate = estimate(problem, layout, state.nuisance, e.values, candidates, e.noise)
+            state.residual = state.estimate.residual
+            _drop_unneeded(problem, layout, state, candidates, state.steps[-1].effect)
+    return _close(problem, layout, state, candidates, null, sealed, limits, settings)
+
+
+def _seal(problem: ResidualProblem, settings: LoopSettings, rng: np.random.Generator) -> tuple[Index, int | None]:
+    labels = np.unique(problem.group)
+    every = np.arange(problem.group.size)
+    if not settings.seal or labels.size < SEALED_FROM:
+        return every, None
+    sealed = int(rng.choice(labels))
+    return every[problem.group != sealed], sealed
+
+
+def _rms(problem: ResidualProblem, layout: Layout, state: State) -> float:
+    """Of what the model's columns leave, by least squares."""
+    columns, data = state.columns[layout.rows], state.residual[layout.rows]
+    if columns.shape[1]:
+        data = data - columns @ np.linalg.lstsq(columns, data, rcond=None)[0]
+    return float(np.sqrt(np.mean(data**2)))
+
+
+def _limits(
+    problem: ResidualProblem,
+    layout: Layout,
+    state: State,
+    candidates: Mapping[str, Candidate],
+    settings: LoopSettings,
+) -> list[identifiability.Limit]:
+    """Noise with every candidate projected off: an effect must not hide itself."""
+    found = _members(problem, state, candidates)
+    rows, p = layout.rows, state.nuisance.shape[1]
+    if not found:
+        return []
+    both = np.column_stack([state.nuisance, *(m.columns for m in found)])[rows]
+    noise = fit_noise(layout, both, state.residual[rows], state.noise)
+    m = project(gram(layout, noise, np.column_stack([both, state.residual[rows]])), slice(0, p))
+    where = spans([one.columns.shape[1] for one in found], p)
+    return identifiability.limits(m, where, found, candidates, settings.snr)
+
+
+def _members(problem: ResidualProblem, state: State, candidates: Mapping[str, Candidate]) -> list[Member]:
+    out = {*state.values, *state.blocked, *state.dropped}
+    free = [c for name, c in candidates.items() if name not in out]
+    return [m for c in free for m in members(problem, state.values, state.residual, c)]
+
+
+def _named_step(
+    problem: ResidualProblem,
+    layout: Layout,
+    state: State,
+    candidates: Mapping[str, Candidate],
+    settings: LoopSettings,
+    rng: np.random.Generator,
+) -> bool:
+    """Add the best confirmed candidate; False where none is left that passes."""
+    rows = layout.rows
+    while True:
+        found = _members(problem, state, candidates)
+        columns, data = state.columns, state.residual
+        signatures = [m.columns[rows] for m in found]
+        finding, state.noise = search(layout, columns[rows], signatures, data[rows], state.noise, settings.draws, rng)
+        if finding is None or finding.p > settings.p_value:
+            return False
+        member = found[finding.index]
+        step = _examine(problem, layout, state, candidates, found, finding, settings, rng)
+        if isinstance(step, Refusal):
+            state.notes.append(f"{member.effect} stands out (p = {finding.p:.2g}) but is not added: {step.why}")
+            if step.structure and finding.p < CERTAIN:
+                state.certain.append(member.effect)
+            state.blocked.add(member.effect)
+            continue
+        added, record = step
+        state.estimate, state.residual, state.noise = added, added.residual, added.noise
+        state.steps.append(record)
+        state.blocked.clear()
+        _drop_unneeded(problem, layout, state, candidates, member.effect)
+        return True
+
+
+def _examine(
+    problem: ResidualProblem,
+    layout: Layout,
+    state: State,
+    candidates: Mapping[str, Candidate],
+    found: Sequence[Member],
+    finding: Finding,
+    settings: LoopSettings,
+    rng: np.random.Generator,
+) -> tuple[Estimate, Step] | Refusal:
+    """The new estimate and its step, or why not."""
+    rows, columns, data = layout.rows, state.columns, state.residual
+    member, p = found[finding.index], columns.shape[1]
+    if np.unique(problem.group[rows]).size < 2:
+        return Refusal("there are no groups to hold out", True)
+    whole = np.column_stack([columns, *(m.columns for m in found), data])[rows]
+    projected = project(gram(layout, finding.noise, whole), slice(0, p))
+    where = spans([m.columns.shape[1] for m in found], p)
+    amplitude, _ = solve(projected, where[finding.index])
+    rivals = identifiability.rivals(projected, where, found, finding.index, settings.snr)
+
+    values = merged(state.values, member.effect, member.start(amplitude))
+    estimated = estimate(problem, layout, state.nuisance, values, candidates, finding.noise)
+    if outside := [name for name in estimated.at_bound if name.startswith(f"{member.effect}.")]:
+        return Refusal(f"{', '.join(outside)} ends on its physical bound", True)
+    reached, valid = confirmation.controls(
+        problem, layout, finding.noise, columns[rows], member.columns[rows], data[rows], settings.controls, rng
+    )
+    if not confirmation.controls_fail(reached, valid):
+        return Refusal(f"{reached} of {valid} shifted copies of its signature do as well", False)
+    term = data - estimated.residual
+    helped = _beside(layout, columns, data, term, found, member.effect, estimated.noise)
+    if winner := _better_covariate(problem, layout, helped, columns, data, term, estimated.noise):
+        return Refusal(f"a spline of {winner} explains the same and more, and leaves nothing for it", True)
+
+    if worst := _varies_with(problem, layout, helped, p, data, term, estimated.noise):
+        return Refusal(f"its size changes with {worst}: it stands for something else", True)
+    before = Model(data, columns)
+    library = [Model(data, np.column_stack([columns, m.columns])) for m in found]
+    own = tuple(state.nuisance.shape[1] + c for c in estimated.columns(member.effect))
+    refined = Model(estimated.residual, np.column_stack([state.nuisance, estimated.signatures]), added=own, term=term)
+    families = [m.effect if m.effect not in rivals else member.effect for m in found]
+    checked = confirmation.confirm(problem, rows, before, library, families, finding.index, refined, finding.noise)
+    if not checked.passes(settings.gain, settings.decisive):
+        return Refusal(_why_not(checked), _repeats(checked))
+    tests = f"largest of {len(found)} tests, {_noise_text(problem, finding.noise)}"
+    evidence = f"p = {finding.p:.2g} ({tests}); {_held_out_text(problem, checked)}; {_controls_text(reached, valid)}"
+    if rivals:
+        beside = ", ".join(f"{name} ({snr:.1f} sigma left)" for name, snr in rivals.items())
+        evidence += f"; cannot be told from {beside}"
+    record = Step(
+        problem.stage, member.effect, {}, evidence, tuple(rivals), checked.before, checked.after, finding.p
+    )  # fmt: skip
+    return estimated, record
+
+
+def _beside(
+    layout: Layout,
+    columns: Array,
+    data: Array,
+    term: Array,
+    found: Sequence[Member],
+    effect: str,
+    noise: Noise,
+) -> Array:
+    """Columns (rows, p + 1 + …): the model's, the effect's term, and the two other effects that best add to it, if any does."""
+    rows = layout.rows
+    beside = [columns[rows], term[rows, None]]
+    rest = [m for m in found if m.effect != effect]
+    for _ in range(2):
+        if not rest:
+            break
+        now = np.column_stack(beside)
+        whole = np.column_stack([now, *(r.columns[rows] for r in rest), data[rows]])
+        m = project(gram(layout, noise, whole), slice(0, now.shape[1]))
+        scores = []
+        for own in spans([r.columns.shape[1] for r in rest], now.shape[1]):
+            value, rank = statistic(m, own)
+            scores.append(float(chdtrc(rank, value)) if rank else 1.0)
+        best = int(np.argmin(scores))
+        if scores[best] > UNNEEDED / len(rest):
+            break
+        beside.append(rest[best].columns[rows])
+        rest = [r for r in rest if r.effect != rest[best].effect]
+    return np.column_stack(beside)
+
+
+def _varies_with(
+    problem: ResidualProblem, layout: Layout, helped: Array, p: int, data: Array, term: Array, noise: Noise
+) -> str | None:
+    """The covariate with which the size of the effect's term (n,), column `p` of `helped`, changes by over a third (a tenth of
+    its χ²), "group" for the held-out groups: a parameter of the instrument is one number, so that a term that wants several
+    stands for something else. A little less is an effect that is not exactly of the declared form."""
+    rows = layout.rows
+    labels = np.unique(problem.group[rows])
+    trials = {name: (term * (c - c[rows].mean()))[rows, None] for name, c in problem.covariates.items()}
+    trials["group"] = np.column_stack([term[rows] * (problem.group[rows] == one) for one in labels[1:]])
+    h = helped.shape[1]
+    m = gram(layout, noise, np.column_stack([helped, *trials.values(), data[rows]]))
+    size, _ = statistic(project(m, [i for i in range(h) if i != p]), [p])
+    m = project(m, slice(0, h))
+    worst, lowest = None, COVARIATE_WINS / len(trials)
+    for name, own in zip(trials, spans([t.shape[1] for t in trials.values()], h), strict=True):
+        value, rank = statistic(m, own)
+        chance = float(chdtrc(rank, value)) if rank else 1.0
+        if chance < lowest and value > CHANGES * size:
+            worst, lowest = name, chance
+    return worst
+
+
+def _better_covariate(
+    problem: ResidualProblem, layout: Layout, helped: Array, columns: Array, data: Array, term: Array, noise: Noise
+) -> str | None:
+    """The covariate whose spline leaves nothing of the effect's term, while the term leaves much of the spline.
+
+    What the next two other effects take up beside the term (`helped`) is not held against it.
+    """
+    rows, p = layout.rows, columns.shape[1]
+    winner, lowest = None, COVARIATE_WINS / max(len(problem.covariates), 1)
+    for name, spline in _splines(problem, layout).items():
+        q = spline.shape[1]
+        extra = fit_noise(layout, np.column_stack([columns[rows], term[rows], spline[rows]]), data[rows], noise)
+        m = gram(layout, extra, np.column_stack([helped, spline[rows], data[rows]]))
+        h = helped.shape[1]
+        value, rank = statistic(project(m, slice(0, h)), range(h, h + q))
+        if not rank or (p_spline := float(chdtrc(rank, value))) >= lowest:
+            continue
+        off = [*range(p), *range(p + 1, h), *range(h, h + q)]
+        value, rank = statistic(project(m, off), [p])
+        if not rank:  # the term is a curve of this covariate, and the curve is another one
+            continue
+        if float(chdtrc(rank, value)) > UNNEEDED:
+            winner, lowest = name, p_spline
+    return winner
+
+
+def _splines(problem: ResidualProblem, layout: Layout, count: int = 7) -> dict[str, Array]:
+    out = {}
+    for name, covariate in problem.covariates.items():
+        columns = learned.spline_columns(covariate, learned.knots(covariate[layout.rows], count))
+        if columns.shape[1]:
+            out[name] = columns
+    return out
+
+
+def _drop_unneeded(
+    problem: ResidualProblem, layout: Layout, state: State, candidates: Mapping[str, Candidate], last: str
+) -> None:
+    """Effects that the last addition has made superfluous: a first choice that stood for something else.
+
+    What stays must still stand out of as many tests as the library makes.
+    """
+    tests = sum(max(len(c.grid), 1) for c in candidates.values())
+    while state.estimate is not None:
+        e = state.estimate
+        p, rows = state.nuisance.shape[1], layout.rows
+        whole = np.column_stack([state.nuisance, e.signatures, e.residual])[rows]
+        m = project(gram(layout, e.noise, whole), slice(0, p))
+        weakest, highest = "", UNNEEDED / tests
+        for effect in e.values:
+            own = [p + c for c in e.columns(effect)]
+            others = [p + c for c in range(len(e.order)) if p + c not in own]
+            at = np.array([e.values[effect][name] for name in candidates[effect].parameters])
+            information = project(m, others)[np.ix_(own, own)]
+            rank = sum(bool(v > 0.0) for v in np.diag(information)) or 1
+            p_value = float(chdtrc(rank, max(at @ information @ at, 0.0)))
+            if effect != last and p_value > highest:
+                weakest, highest = effect, p_value
+        if not weakest:
+            return
+        state.steps = [s for s in state.steps if s.effect != weakest]
+        state.notes.append(f"{weakest} is taken out again: beside {last} the data do not need it")
+        state.dropped.add(weakest)
+        values = {name: v for name, v in e.values.items() if name != weakest}
+        if values:
+            state.estimate = estimate(problem, layout, state.nuisance, values, candidates, e.noise)
+            state.residual = state.estimate.residual
+        else:
+            state.estimate, state.residual = None, np.asarray(problem.residual({}), float)
+
+
+def _learned_step(
+    problem: ResidualProblem, layout: Layout, state: State, settings: LoopSettings, rng: np.random.Generator
+) -> bool:
+    """Add the spline of a covariate that explains what is left, if held-out error falls; False where none does."""
+    rows, columns, data = layout.rows, state.columns, state.residual
+    p = columns.shape[1]
+    done = {s.effect for s in state.steps}
+    splines = {
+        name: s
+        for name, s in _splines(problem, layout, settings.spline_columns).items()
+        if f"learned:{name}" not in done
+    }
+    if not splines or np.unique(problem.group[rows]).size < 2:
+        return False
+    names = list(splines)
+    finding, state.noise = search(
+        layout, columns[rows], [splines[n][rows] for n in names], data[rows], state.noise, settings.draws, rng
+    )
+    if finding is None or finding.p > settings.p_value:
+        return False
+    name = names[finding.index]
+    spline = splines[name]
+    own = tuple(range(p, p + spline.shape[1]))
+    reached, valid = confirmation.controls(
+        problem, layout, finding.noise, columns[rows], spline[rows], data[rows], settings.controls, rng
+    )
+    both = np.column_stack([columns, spline])
+    model = Model(data, both, smooth=own, added=own)
+    m = gram(layout, finding.noise, np.column_stack([both, data])[rows])
+    beta = confirmation.coefficients(m, both.shape[1], model)
+    term = spline @ beta[list(own)]
+    library = [
+        Model(data, np.column_stack([columns, s]), smooth=tuple(range(p, p + s.shape[1]))) for s in splines.values()
+    ]
+    checked = confirmation.confirm(
+        problem, rows, Model(data, columns), library, names, finding.index, model, finding.noise
+    )
+    if not confirmation.controls_fail(reached, valid):
+        problem_text = f"{reached} of {valid} shifted copies of it do as well"
+    elif not checked.passes(settings.gain, settings.decisive):
+        problem_text = _why_not(checked)
+    else:
+        size = float(np.sqrt(np.mean((term[rows] - term[rows].mean()) ** 2)))
+        sigma = size / float(np.sqrt(max(finding.chi2, 1e-300)))
+        tests = f"largest of {len(names)} covariates, {_noise_text(problem, finding.noise)}"
+        share = f"permutation p = {(1 + reached) / (1 + valid):.2g}" if valid else "no permutation possible"
+        state.steps.append(
+            Step(
+                problem.stage,
+                f"learned:{name}",
+                {"rms": Value(size, sigma, problem.unit)},
+                f"p = {finding.p:.2g} ({tests}); {_held_out_text(problem, checked)}; {share} of {valid} shifts within series",
+                (),
+                checked.before,
+                checked.after,
+                finding.p,
+                table=learned.curve(problem.covariates[name], term),
+            )
+        )
+        state.nuisance = np.column_stack([state.nuisance, spline])
+        state.noise = finding.noise
+        return True
+    state.notes.append(f"{name} stands out among covariates (p = {finding.p:.2g}) but is not used: {problem_text}")
+    if finding.p < CERTAIN and _repeats(checked) and confirmation.controls_fail(reached, valid):
+        state.certain.append(f"learned:{name}")
+    return False
+
+
+def _close(
+    problem: ResidualProblem,
+    layout: Layout,
+    state: State,
+    candidates: Mapping[str, Candidate],
+    null: Array,
+    sealed: int | None,
+    limits: Sequence[identifiability.Limit],
+    settings: LoopSettings,
+) -> LoopResult:
+    """The sealed group, once; final values of all steps; the verdict."""
+    rows = layout.rows
+    noise = state.noise or fit_noise(layout, state.columns[rows], state.residual[rows])
+    before = Model(null, np.asarray(problem.nuisance, float))
+    after = Model(state.residual, state.columns)
+    rms_before = rms_after = _cross_validated(problem, rows, before, noise)
+    if state.steps:
+        rms_after = _cross_validated(problem, rows, after, noise)
+    once: Sealed | None = None
+    steps = [_with_values(problem, s, state.estimate, candidates) for s in state.steps]
+    values: Mapping[str, Mapping[str, float]] = state.values
+    if sealed is not None and np.isfinite(null).all():
+        held = np.flatnonzero(problem.group == sealed)
+        e0, l0, _ = confirmation.held_out(problem, rows, held, before, noise, refit=bool(state.steps))
+        e1, l1 = e0, l0
+        if state.steps:
+            e1, l1, _ = confirmation.held_out(problem, rows, held, after, noise)
+        name = problem.group_names.get(sealed, str(sealed))
+        once = Sealed(name, float(np.sqrt(np.mean(e0**2))), float(np.sqrt(np.mean(e1**2))), l1 - l0)
+        if steps and once.log_likelihood < -settings.decisive and once.after > once.before:
+            names = ", ".join(s.effect for s in steps)
+            state.notes.append(
+                f"taken back, {names}: the sealed group {name} is worse with it,"
+                f" {once.before:.3g} → {once.after:.3g} {problem.unit}"
+            )
+            state.certain.append(names)
+            steps, values, rms_after = [], {}, rms_before
+    if problem.sigma is not None and not steps:
+        white = float(np.sqrt(np.mean([c.variance for c in noise])))
+        rms = _rms(problem, layout, state)
+        excess = (rms / problem.sigma) ** 2 * rows.size
+        if rms > EXCESS * problem.sigma and chdtrc(rows.size - state.columns.shape[1], excess) < CERTAIN:
+            state.notes.append(
+                f"what is left is {rms / problem.sigma:.3g} times the declared sigma (its white part {white / problem.sigma:.3g})"
+            )
+            state.certain.append("excess")
+    families = [
+        identifiability.Limit(
+            (s.effect, *s.indistinguishable_from), f"either explains the data: {s.evidence.rsplit('; ', 1)[-1]}",
+            would_separate((s.effect, *s.indistinguishable_from)),
+        )
+        for s in steps
+        if s.indistinguishable_from
+    ]  # fmt: skip
+    named = {frozenset(f.effects) for f in families}
+    limits = [*families, *(one for one in limits if frozenset(one.effects) not in named)]
+    verdict: Verdict = "effects_added" if steps else "unexplained" if state.certain else "no_effect"
+    return LoopResult(
+        problem.stage,
+        verdict,
+        tuple(steps),
+        tuple(limits),
+        values,
+        noise,
+        rms_before,
+        rms_after,
+        once,
+        tuple(state.notes),
+    )
+
+
+def _cross_validated(problem: ResidualProblem, rows: Index, model: Model, noise: Noise) -> float:
+    """RMS of the groups held out one by one."""
+    folds = [rows[f] for f in confirmation.folds_of(problem.group[rows])]
+    if len(folds) < 2:
+        return float("nan")
+    errors = [confirmation.held_out(problem, np.setdiff1d(rows, held), held, model, noise, False)[0] for held in folds]
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+
+
+def _with_values(
+    problem: ResidualProblem, step: Step, estimated: Estimate | None, candidates: Mapping[str, Candidate]
+) -> Step:
+    """The step with the final joint estimate's parameters and their correlations with all others."""
+    if estimated is None or step.effect not in estimated.values:
+        return step
+    units = candidates[step.effect].parameters
+    parameters, correlations = {}, {}
+    for i in estimated.columns(step.effect):
+        name = estimated.order[i][1]
+        parameters[name] = Value(estimated.values[step.effect][name], float(estimated.sigma[i]), units[name].unit)
+        for j, (other, what) in enumerate(estimated.order):
+            if j != i:
+                correlations[f"{name}, {other}.{what}"] = float(estimated.correlation[i, j])
+    return replace(step, parameters=parameters, correlations=correlations)
+
+
+def _repeats(checked: Confirmation) -> bool:
+    """Whether what one part of the data shows helps another part at all: else it is no structure of the instrument."""
+    return checked.gain > 0.0 and checked.log_likelihood > 0.0
+
+
+def _why_not(checked: Confirmation) -> str:
+    if 2 * checked.chosen <= checked.folds:
+        return f"only {checked.chosen} of {checked.folds} training parts choose it"
+    if not checked.same_sign:
+        return "its sign changes from fold to fold"
+    return (
+        f"held-out RMS changes by {-100.0 * checked.gain:+.1f} % only, log-likelihood by {checked.log_likelihood:+.1f}"
+    )
+
+
+def _held_out_text(problem: ResidualProblem, c: Confirmation) -> str:
+    return (
+        f"held-out RMS {c.before:.4g} → {c.after:.4g} {problem.unit} ({-100.0 * c.gain:+.1f} %), log-likelihood"
+        f" {c.log_likelihood:+.1f}, chosen in {c.chosen} of {c.folds} folds"
+    )
+
+
+def _controls_text(reached: int, valid: int) -> str:
+    if valid < confirmation.FEWEST_CONTROLS:
+        return "its signature has no shifted copy that could serve as a control"
+    return f"{reached} of {valid} shifted copies of its signature do as well"
+
+
+def _noise_text(problem: ResidualProblem, noise: Noise) -> str:
+    coloured = sum(c.kappa > 1e-7 for c in noise)
+    if coloured == 0:
+        return "white noise"
+    return (
+        "white and Gauss–Markov noise" if len(noise) == 1 else f"noise coloured in {coloured} of {len(noise)} channels"
+    )

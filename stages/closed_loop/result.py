@@ -1,0 +1,96 @@
+"""What the loop answers for one stage: the parts of loop.json that are its own, and what a person reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from stages.closed_loop.identifiability import Limit
+from stages.closed_loop.noise import Noise
+
+Verdict = Literal["effects_added", "no_effect", "unexplained"]
+
+
+@dataclass(frozen=True)
+class Value:
+    """A parameter's value with its sigma and unit."""
+
+    value: float
+    sigma: float
+    unit: str
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"value": self.value, "sigma": self.sigma, "unit": self.unit}
+
+
+@dataclass(frozen=True)
+class Step:
+    """One effect added; held-out figures are RMS in the residual's unit. `table`: the curve of a learned term."""
+
+    stage: str
+    effect: str
+    parameters: Mapping[str, Value]
+    evidence: str
+    indistinguishable_from: tuple[str, ...]
+    heldout_before: float
+    heldout_after: float
+    p_value: float
+    correlations: Mapping[str, float] = field(default_factory=dict)
+    table: Mapping[str, list[float]] | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        out: dict[str, Any] = {
+            "stage": self.stage,
+            "effect": self.effect,
+            "parameters": {name: value.to_dict() for name, value in self.parameters.items()},
+            "evidence": self.evidence,
+            "indistinguishable_from": list(self.indistinguishable_from),
+            "heldout_before": self.heldout_before,
+            "heldout_after": self.heldout_after,
+            "p_value": self.p_value,
+            "correlations": dict(self.correlations),
+        }
+        if self.table is not None:
+            out["table"] = dict(self.table)
+        return out
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """The group that was touched once, at the end: RMS before and after, gain in log-likelihood."""
+
+    group: str
+    before: float
+    after: float
+    log_likelihood: float
+
+
+@dataclass(frozen=True)
+class LoopResult:
+    """Verdict of one stage with its steps, limits, notes; `values` are the effects that its model lacked."""
+
+    stage: str
+    verdict: Verdict
+    steps: tuple[Step, ...]
+    not_identifiable: tuple[Limit, ...]
+    values: Mapping[str, Mapping[str, float]]
+    noise: Noise
+    rms_before: float
+    rms_after: float
+    sealed: Sealed | None
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Keys as in loop.json; `before` and `after` hold this stage's held-out RMS."""
+        return {
+            "verdict": self.verdict,
+            "steps": [step.to_dict() for step in self.steps],
+            "not_identifiable": [
+                {"effects": list(one.effects), "why": one.why, "would_separate": one.would_separate}
+                for one in self.not_identifiable
+            ],
+            "before": {f"{self.stage}_residual_rms": self.rms_before},
+            "after": {f"{self.stage}_residual_rms": self.rms_after},
+            "notes": list(self.notes),
+        }
