@@ -6,6 +6,8 @@ beside that model; how it arises in nature is written anew in `tsmftis.simulator
 Functions
 ---------
 amounts         an effect's parameters out of a set of effects, zero where they are not given
+scalars         names of an effect's parameters one by one: a list of three as gyro.x, gyro.y, gyro.z
+nested          values by such names → lists of three where an effect has them
 refuse_others   ValueError on what is no effect on the models of certain stages
 """
 
@@ -78,6 +80,28 @@ def amounts(effects: Effects, name: str) -> tuple[float, ...]:
     """The values of an effect's parameters, in the table's order; zero where the effect or a parameter is not given."""
     given = effects.get(name, {})
     return tuple(given.get(key, 0.0) for key in EFFECTS[name].units)
+
+
+def scalars(name: str) -> dict[str, str]:
+    """Scalar parameter → key in `EFFECTS[name].units`: {"half_width": "half_width", "gyro.x": "gyro", …}."""
+    effect = EFFECTS[name]
+    return {
+        scalar: key
+        for key in effect.units
+        for scalar in ([f"{key}.{axis}" for axis in XYZ] if key in effect.lists else [key])
+    }
+
+
+def nested(values: Effects) -> dict[str, dict[str, Any]]:
+    """Every parameter of the named effects, those of `scalars` gathered into tuples of three; zero where not given."""
+    out: dict[str, dict[str, Any]] = {}
+    for name, given in values.items():
+        effect = EFFECTS[name]
+        out[name] = {
+            key: tuple(given.get(f"{key}.{axis}", 0.0) for axis in XYZ) if key in effect.lists else given.get(key, 0.0)
+            for key in effect.units
+        }
+    return out
 
 
 def refuse_others(effects: Mapping[str, Mapping[str, Any]], *stages: str) -> None:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tsmftis.camera import Camera, Mounting, angular_acceleration, camera_pose
 from tsmftis.detector import undo_nonlinearity
-from tsmftis.effects import EFFECTS, amounts, refuse_others
+from tsmftis.effects import EFFECTS, amounts, nested, refuse_others, scalars
 from tsmftis.geodesy import ned_to_ecef_dcm
 from tsmftis.interferometer import Interferometer, response_with_effects
 
@@ -116,3 +116,15 @@ def test_bounds_belong_to_parameters() -> None:
     for effect in EFFECTS.values():
         assert set(effect.largest) == set(effect.units)
         assert set(effect.least) | effect.lists <= set(effect.units)
+
+
+def test_lists_of_three_have_scalar_names_and_are_put_together_again() -> None:
+    assert list(scalars("thermal_hysteresis")) == [
+        "half_width",
+        *(f"{k}.{a}" for k in ("gyro", "accel") for a in "xyz"),
+    ]
+    values = {"thermal_hysteresis": {"half_width": 6.0, "gyro.y": 2e-7}, "boresight": {"yaw": 0.1}}
+    assert nested(values) == {
+        "thermal_hysteresis": {"half_width": 6.0, "gyro": (0.0, 2e-7, 0.0), "accel": (0.0, 0.0, 0.0)},
+        "boresight": {"roll": 0.0, "pitch": 0.0, "yaw": 0.1},
+    }
