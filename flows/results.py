@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -132,7 +133,7 @@ def _provenance(plan: Plan) -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": {name: version(name) for name in PACKAGES},
         "settings": plan.settings.model_dump(mode="json"),
-        "model_update": plan.update,
+        "model_update": {k: v for k, v in asdict(plan.update).items() if v},
     }
 
 

@@ -22,7 +22,7 @@ from pipeline.datasets import open_dataset, write_dataset
 from pipeline.errors import InputError
 from pipeline.formats import sbet, smrmsg
 from pipeline.formats.table import write_csv
-from pipeline.model_update import Effects
+from pipeline.model_update import Effects, ModelUpdate
 from pipeline.raster import CubeGrid, Dem, write_cube
 from pipeline.records import CameraPoses, Spectra, Tracks, Trajectory
 from pipeline.run_stage import StageRecord, run_stage, write_json
@@ -32,8 +32,6 @@ from stages import mapping, navigation, reconstruction, registration, scoring, t
 from tsmftis import __version__
 from tsmftis.effects import EFFECTS
 from tsmftis.fourier import SCORED_APODIZATION, line_width, rqe, smooth_phase
-
-UPDATED = frozenset({"thermal", "navigation", "geometry", "spectral"})  # stages whose models take a model update
 
 # Each stage and the stages whose results it reads, in the order in which a reader should meet them.
 NEEDS: Mapping[str, tuple[str, ...]] = {
@@ -67,7 +65,7 @@ class Plan:
     start: str | None = None  # --from: this stage and those after it run again
     only: str | None = None  # --only: this stage alone
     lines: tuple[str, ...] = ()  # --line: LINE or FLIGHT/LINE; empty: all
-    update: Effects = field(default_factory=dict)  # --model-update: what the declared models lack
+    update: ModelUpdate = field(default_factory=ModelUpdate)  # --model-update: what the declared models lack
     truth: Path | None = None  # --truth: folder with true poses, of which the method `true` is made
 
     @cached_property
@@ -76,7 +74,12 @@ class Plan:
 
     def effects(self, *stages: str) -> Effects:
         """The update's effects on the models of these stages, as `tsmftis.effects` names them."""
-        return {name: values for name, values in self.update.items() if EFFECTS[name].stage in stages}
+        return {name: v for name, v in self.update.effects.items() if EFFECTS[name].stage in stages}
+
+    def bench_effects(self, bench: str) -> Effects:
+        """Those on a laboratory interferogram: its own where the update names it, else those of the instrument."""
+        own = self.update.bench.get(bench)
+        return self.effects("spectral") if own is None else own
 
     def wants(self, flight: str, line: str) -> bool:
         return not self.lines or line in self.lines or f"{flight}/{line}" in self.lines
@@ -510,7 +513,7 @@ def bench_step(plan: Plan, bench: str) -> StageRecord:
 
     def work(to: Paths) -> dict[str, Any]:
         with _naming(bench=campaign.path(entry.file)):
-            result = bench_stage.run(campaign.bench(bench), plan.settings.bench, plan.effects("spectral"))
+            result = bench_stage.run(campaign.bench(bench), plan.settings.bench, plan.bench_effects(bench))
         write_dataset(result.to_dataset(), to["spectrum"])
         return {
             "relative_rms": result.relative_rms,
@@ -524,7 +527,7 @@ def bench_step(plan: Plan, bench: str) -> StageRecord:
         "bench",
         bench,
         ("stages.bench",),
-        {"settings": _plain(plan.settings.bench), "effects": plan.effects("spectral")},
+        {"settings": _plain(plan.settings.bench), "effects": plan.bench_effects(bench)},
         {"interferogram": campaign.path(entry.file)},
         {"spectrum": f"bench/{bench}.nc"},
         work,

@@ -4,49 +4,119 @@
     effects:
       gnss_latency: {latency: 0.04}
       antenna_lever_arm: {x: 0.1, y: 0.0, z: -0.2}
+    bench:                          # optional
+      mct: {detector_nonlinearity: {a: -0.015}}
+    learned:                        # optional
+      - {stage: thermal, covariate: time, unit: rad s-1, table: {covariate: [0, 10], value: [0.0, 1.0e-7]}}
 
 Names, parameters and units are those of `tsmftis.effects`; a parameter left out is zero, one of three axes a list of three.
+A laboratory interferogram that `bench` names has its own effects and not those of `effects`: its detector is another one.
+Learned terms are what the closed loop found without a name: curves of what is left over a covariate. No model applies them.
+
+Functions
+---------
+read_model_update    file → ModelUpdate
+write_model_update   ModelUpdate → file
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from pipeline.errors import InputError
 from pipeline.yaml_file import load_yaml
 from tsmftis.effects import EFFECTS, Effect
 
 FORMAT = "tsmftis-model-update/1"
+SECTIONS = ("format", "effects", "bench", "learned")
+LEARNED = ("stage", "covariate", "unit", "table")
 Effects = dict[str, dict[str, Any]]  # floats, and tuples of three where an effect has lists
 
 
-def read_model_update(path: Path, applied: frozenset[str]) -> Effects:
-    """Effects by name, every parameter given; raises InputError for what is no effect, or of a stage that is not `applied`."""
+@dataclass(frozen=True)
+class ModelUpdate:
+    """`effects` of the campaign's instrument; `bench`: those of single laboratory interferograms; `learned`: curves on record,
+    each with stage, covariate, unit and table {covariate: […], value: […]}."""
+
+    effects: Effects = field(default_factory=dict)
+    bench: Mapping[str, Effects] = field(default_factory=dict)
+    learned: tuple[Mapping[str, Any], ...] = ()
+
+
+def read_model_update(path: Path) -> ModelUpdate:
+    """Every effect with every parameter; raises InputError for what is no effect, no number or beyond belief."""
     content = load_yaml(path, "give an existing model update")
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(path, "key 'format'", f"is not {FORMAT}", f"write  format: {FORMAT}")
-    if unknown := sorted(set(content) - {"format", "effects"}):
-        raise InputError(path, f"key '{unknown[0]}'", "is not known", "a model update has format and effects")
-    effects = content.get("effects") or {}
+    if unknown := sorted(set(content) - set(SECTIONS)):
+        raise InputError(path, f"key '{unknown[0]}'", "is not known", f"a model update has {', '.join(SECTIONS)}")
+    bench = content.get("bench") or {}
+    if not isinstance(bench, dict):
+        raise InputError(path, "key 'bench'", "holds no keys", "write  bench: {id: {detector_nonlinearity: {a: 0.01}}}")
+    return ModelUpdate(
+        _effects(path, "effects", content.get("effects") or {}),
+        {str(name): _effects(path, f"bench.{name}", given or {}) for name, given in bench.items()},
+        _learned(path, content.get("learned") or []),
+    )
+
+
+def write_model_update(update: ModelUpdate, path: Path) -> None:
+    """The same file for the same content; sections that hold nothing are left out, but for `effects`."""
+    content: dict[str, Any] = {"format": FORMAT, "effects": _listed(update.effects)}
+    if update.bench:
+        content["bench"] = {name: _listed(effects) for name, effects in update.bench.items()}
+    if update.learned:
+        content["learned"] = [dict(one) for one in update.learned]
+    text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def _listed(effects: Effects) -> dict[str, dict[str, Any]]:
+    """Tuples as lists, which YAML knows."""
+    return {
+        name: {key: list(v) if isinstance(v, tuple) else v for key, v in values.items()}
+        for name, values in effects.items()
+    }
+
+
+def _effects(path: Path, section: str, effects: Any) -> Effects:
     if not isinstance(effects, dict):
-        raise InputError(path, "key 'effects'", "holds no keys", "write  effects: {gnss_latency: {latency: 0.04}}")
-    return {name: _effect(path, name, given, applied) for name, given in effects.items()}
+        raise InputError(path, f"key '{section}'", "holds no keys", "write  effects: {gnss_latency: {latency: 0.04}}")
+    return {name: _effect(path, f"{section}.{name}", name, given) for name, given in effects.items()}
 
 
-def _effect(path: Path, name: Any, given: Any, applied: frozenset[str]) -> dict[str, float]:
-    place = f"key 'effects.{name}'"
+def _learned(path: Path, given: Any) -> tuple[Mapping[str, Any], ...]:
+    if not isinstance(given, list):
+        raise InputError(path, "key 'learned'", "is no list", "write one entry a curve, or leave it out")
+    for i, one in enumerate(given):
+        place = f"key 'learned[{i}]'"
+        if not isinstance(one, dict) or set(one) != set(LEARNED):
+            raise InputError(path, place, "is no learned term", f"it has {', '.join(LEARNED)}")
+        table = one["table"]
+        columns = [table.get(k) if isinstance(table, dict) else None for k in ("covariate", "value")]
+        if (
+            not all(isinstance(c, list) and all(isinstance(v, int | float) for v in c) for c in columns)
+            or len({len(c or []) for c in columns}) != 1
+        ):
+            raise InputError(
+                path, f"{place[:-1]}.table'", "is no table", "give covariate and value, lists of one length"
+            )
+    return tuple(given)
+
+
+def _effect(path: Path, where: str, name: Any, given: Any) -> dict[str, Any]:
+    place = f"key '{where}'"
+    if str(name).startswith("learned:"):
+        raise InputError(path, place, "has no parameters", "a learned term stands under learned, with its table")
     if name not in EFFECTS:
         raise InputError(path, place, "is no known effect", f"use one of {', '.join(EFFECTS)}")
     effect = EFFECTS[name]
-    if effect.stage not in applied:
-        raise InputError(
-            path,
-            place,
-            f"changes the {effect.stage} model, which takes no update yet",
-            f"leave it out; updates are taken by {', '.join(sorted(applied))}",
-        )
     if not isinstance(given, dict):
         shape = ", ".join(f"{k}: {'[…, …, …]' if k in effect.lists else '…'}" for k in effect.units)
         raise InputError(path, place, "holds no parameters", f"write {{{shape}}}")

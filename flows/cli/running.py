@@ -16,11 +16,11 @@ from rich.table import Table
 
 from flows.results import SCORES
 from flows.settings import load_settings
-from flows.steps import STAGES, UPDATED, Plan
+from flows.steps import STAGES, Plan
 from pipeline.campaign import Campaign, read_campaign
 from pipeline.errors import InputError
 from pipeline.inspect import check_campaign
-from pipeline.model_update import read_model_update
+from pipeline.model_update import ModelUpdate, read_model_update
 from pipeline.records import LADDER
 from pipeline.run_stage import StageRecord
 from pipeline.truth import true_poses_file
@@ -74,14 +74,14 @@ def run(
             raise InputError(option, f"'{stage}'", "is no stage", f"use one of {', '.join(STAGES)}")
     if start and only:
         raise InputError("--from", "with --only", "contradict each other", "give one of them")
-    effects = read_model_update(update, UPDATED) if update is not None else {}
+    taken = read_model_update(update) if update is not None else ModelUpdate()
     opened = read_campaign(campaign)
     if truth is not None and not any(
         true_poses_file(truth, entry.id) for f in opened.keys.flights for entry in f.lines
     ):
         raise InputError(truth, "--truth", "holds no <line>.npz of the campaign's lines", "give the truth folder")
     known_truth = None if truth is None else truth.resolve()
-    plan = Plan(campaign.resolve(), out.resolve(), settings, start, only, tuple(line or ()), effects, known_truth)
+    plan = Plan(campaign.resolve(), out.resolve(), settings, start, only, tuple(line or ()), taken, known_truth)
     known = {i for f in opened.keys.flights for entry in f.lines for i in (entry.id, f"{f.id}/{entry.id}")}
     if unknown := [i for i in plan.lines if i not in known]:
         raise InputError(
@@ -134,8 +134,8 @@ def _process(plan: Plan, opened: Campaign, warnings: list[str], dask: str | None
     # In the order that run.json has, so that report and table do not hang on what was computed and what was read back.
     content = json.loads(json.dumps(assemble(plan, records), sort_keys=True))
     write_run(plan, content)
-    if plan.update:
-        console.print(f"model update: {', '.join(plan.update)}", markup=False)
+    for said in told(plan.update):
+        console.print(said, markup=False)
     ran = sum(record.status == "done" and not record.cached for record in records)
     console.print(f"ran {ran} of {len(records)} stages; writing the report", markup=False)
     report = write_report(opened, plan.out, content, plan.settings.model_dump(mode="json"), warnings)
@@ -151,6 +151,19 @@ def _process(plan: Plan, opened: Campaign, warnings: list[str], dask: str | None
         raise wrong_input
     if any(record.status == "failed" for record in records):
         raise typer.Exit(1)
+
+
+def told(update: ModelUpdate) -> list[str]:
+    """What a model update does, and what of it is on record only."""
+    said = []
+    if update.effects:
+        said.append(f"model update: {', '.join(update.effects)}")
+    said += [f"model update of bench {i}: {', '.join(effects) or 'none'}" for i, effects in update.bench.items()]
+    said += [
+        f"model update: learned:{one['covariate']} of the stage {one['stage']} is on record, and applied by no model"
+        for one in update.learned
+    ]
+    return said
 
 
 def belongs(plan: Plan, name: str, out: Path) -> None:

@@ -21,7 +21,7 @@ from stages.closed_loop import confirmation, identifiability, learned
 from stages.closed_loop.confirmation import Confirmation, Model
 from stages.closed_loop.estimation import Estimate, estimate
 from stages.closed_loop.noise import Layout, Noise, fit_noise, gram
-from stages.closed_loop.result import LoopResult, Sealed, Step, Value, Verdict
+from stages.closed_loop.result import Considered, LoopResult, Pictures, Sealed, Step, Value, Verdict
 from stages.closed_loop.score_test import Finding, project, search, solve, spans, statistic
 from stages.closed_loop.separation import would_separate
 from stages.closed_loop.settings import LoopSettings
@@ -58,6 +58,7 @@ class State:
     dropped: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     certain: list[str] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)
     noise: Noise | None = None
 
     @property
@@ -81,7 +82,7 @@ def run(problem: ResidualProblem, settings: LoopSettings, seed: int) -> LoopResu
     state = State(np.asarray(problem.nuisance, float), null)
     candidates = {c.effect: c for c in problem.candidates}
     state.noise = fit_noise(layout, state.nuisance[rows], null[rows])
-    limits = _limits(problem, layout, state, candidates, settings)
+    limits, considered = _first_look(problem, layout, state, candidates, settings)
     while len(state.steps) < settings.steps:
         if _rms(problem, layout, state) <= problem.floor:
             state.notes.append(
@@ -98,7 +99,25 @@ def run(problem: ResidualProblem, settings: LoopSettings, seed: int) -> LoopResu
             state.estimate = estimate(problem, layout, state.nuisance, e.values, candidates, e.noise)
             state.residual = state.estimate.residual
             _drop_unneeded(problem, layout, state, candidates, state.steps[-1].effect)
-    return _close(problem, layout, state, candidates, null, sealed, limits, settings)
+    return _close(problem, layout, state, candidates, null, sealed, limits, considered, settings)
+
+
+def refit(
+    problem: ResidualProblem, values: Values, without: Sequence[int]
+) -> tuple[Values, Mapping[str, Mapping[str, float]]]:
+    """The parameters of the effects in `values`, and their sigmas, from all groups but those of `without`: what a figure on
+    held-out data is to be made with. Raises ValueError where no group is left."""
+    rows = np.flatnonzero(~np.isin(problem.group, list(without)))
+    if rows.size == 0:
+        raise ValueError(f"{problem.stage}: no group is left to fit on")
+    layout, nuisance = Layout.of(problem, rows), np.asarray(problem.nuisance, float)
+    candidates = {c.effect: c for c in problem.candidates}
+    noise = fit_noise(layout, nuisance[rows], np.asarray(problem.residual(values), float)[rows])
+    found = estimate(problem, layout, nuisance, values, candidates, noise)
+    sigma: dict[str, dict[str, float]] = {effect: {} for effect in values}
+    for (effect, name), s in zip(found.order, found.sigma, strict=True):
+        sigma[effect][name] = float(s)
+    return found.values, sigma
 
 
 def _seal(problem: ResidualProblem, settings: LoopSettings, rng: np.random.Generator) -> tuple[Index, int | None]:
@@ -118,23 +137,33 @@ def _rms(problem: ResidualProblem, layout: Layout, state: State) -> float:
     return float(np.sqrt(np.mean(data**2)))
 
 
-def _limits(
+def _first_look(
     problem: ResidualProblem,
     layout: Layout,
     state: State,
     candidates: Mapping[str, Candidate],
     settings: LoopSettings,
-) -> list[identifiability.Limit]:
-    """Noise with every candidate projected off: an effect must not hide itself."""
+) -> tuple[list[identifiability.Limit], dict[str, Considered]]:
+    """What can be told at all, and how each candidate stands. Noise with every candidate projected off: an effect must not hide
+    itself."""
     found = _members(problem, state, candidates)
     rows, p = layout.rows, state.nuisance.shape[1]
     if not found:
-        return []
+        return [], {}
     both = np.column_stack([state.nuisance, *(m.columns for m in found)])[rows]
     noise = fit_noise(layout, both, state.residual[rows], state.noise)
     m = project(gram(layout, noise, np.column_stack([both, state.residual[rows]])), slice(0, p))
     where = spans([one.columns.shape[1] for one in found], p)
-    return identifiability.limits(m, where, found, candidates, settings.snr)
+    considered: dict[str, Considered] = {}
+    for member, own in zip(found, where, strict=True):
+        value, rank = statistic(m, own)
+        p_value = float(chdtrc(rank, value)) if rank else 1.0
+        known = considered.get(member.effect)
+        better = Considered(member.effect, value, rank, p_value, 1 if known is None else known.tests + 1, "")
+        if known is not None and known.p <= p_value:
+            better = replace(known, tests=known.tests + 1)
+        considered[member.effect] = better
+    return identifiability.limits(m, where, found, candidates, settings.snr), considered
 
 
 def _members(problem: ResidualProblem, state: State, candidates: Mapping[str, Candidate]) -> list[Member]:
@@ -164,6 +193,7 @@ def _named_step(
         step = _examine(problem, layout, state, candidates, found, finding, settings, rng)
         if isinstance(step, Refusal):
             state.notes.append(f"{member.effect} stands out (p = {finding.p:.2g}) but is not added: {step.why}")
+            state.refused[member.effect] = step.why
             if step.structure and finding.p < CERTAIN:
                 state.certain.append(member.effect)
             state.blocked.add(member.effect)
@@ -433,6 +463,7 @@ def _close(
     null: Array,
     sealed: int | None,
     limits: Sequence[identifiability.Limit],
+    considered: Mapping[str, Considered],
     settings: LoopSettings,
 ) -> LoopResult:
     """The sealed group, once; final values of all steps; the verdict."""
@@ -493,7 +524,38 @@ def _close(
         rms_after,
         once,
         tuple(state.notes),
+        tuple(replace(c, outcome=_outcome(c.effect, steps, state)) for c in considered.values()),
+        _pictures(problem, state, null, noise),
     )
+
+
+def _outcome(effect: str, steps: Sequence[Step], state: State) -> str:
+    if any(step.effect == effect for step in steps):
+        return "added"
+    if other := [step.effect for step in steps if effect in step.indistinguishable_from]:
+        return f"cannot be told from {', '.join(other)}"
+    if effect in state.dropped:
+        return "taken out again"
+    return state.refused.get(effect, "does not stand out" if not steps else "does not stand out beside what was added")
+
+
+def _pictures(problem: ResidualProblem, state: State, null: Array, noise: Noise) -> Pictures:
+    """On all samples, the sealed group's too."""
+    layout = Layout.of(problem, np.arange(problem.group.size))
+    own = np.asarray(problem.nuisance, float)
+
+    def left(data: Array, columns: Array) -> Array:
+        if not columns.shape[1]:
+            return data
+        both = np.column_stack([columns, data])
+        beta, _ = solve(gram(layout, noise, both), range(columns.shape[1]))
+        return data - columns @ beta
+
+    terms = {}
+    for effect in state.values:
+        without = {name: v for name, v in state.values.items() if name != effect}
+        terms[effect] = left(np.asarray(problem.residual(without), float) - state.residual, own)
+    return Pictures(left(null, own), left(state.residual, state.nuisance), terms)
 
 
 def _cross_validated(problem: ResidualProblem, rows: Index, model: Model, noise: Noise) -> float:

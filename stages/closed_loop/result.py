@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stages.closed_loop.identifiability import Limit
 from stages.closed_loop.noise import Noise
 
@@ -57,6 +60,29 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Considered:
+    """A candidate as it stood before anything was added: χ² of its best member and rank, p of that member alone (not yet of the
+    largest of many), how many tests it makes, and what became of it."""
+
+    effect: str
+    chi2: float
+    rank: int
+    p: float
+    tests: int
+    outcome: str
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Residual (n,) with the stage's own columns taken out by generalised least squares, before and after; `terms`: what each
+    effect added contributes (n,), the same columns taken out, so that residual against term has the slope one."""
+
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+    terms: Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
 class Sealed:
     """The group that was touched once, at the end: RMS before and after, gain in log-likelihood."""
 
@@ -68,7 +94,8 @@ class Sealed:
 
 @dataclass(frozen=True)
 class LoopResult:
-    """Verdict of one stage with its steps, limits, notes; `values` are the effects that its model lacked."""
+    """Verdict of one stage with its steps, limits, notes; `values` are the effects that its model lacked; `considered` the
+    library as it was first looked at; `pictures` the residual for a figure."""
 
     stage: str
     verdict: Verdict
@@ -80,6 +107,8 @@ class LoopResult:
     rms_after: float
     sealed: Sealed | None
     notes: tuple[str, ...]
+    considered: tuple[Considered, ...]
+    pictures: Pictures
 
     def to_dict(self) -> dict[str, Any]:
         """Keys as in loop.json; `before` and `after` hold this stage's held-out RMS."""

@@ -14,9 +14,8 @@ import pytest
 import xarray as xr
 import yaml
 
-from pipeline.errors import InputError
 from pipeline.formats import sbet, smrmsg
-from pipeline.model_update import read_model_update
+from pipeline.model_update import ModelUpdate, read_model_update, write_model_update
 from pipeline.records import Trajectory
 
 SHARED = Path(os.environ.get("TSMFTIS_SHARED", Path(__file__).parents[2].parent / "shared")) / "data" / "sbet"
@@ -144,7 +143,7 @@ def test_a_model_update_reprocesses_with_the_effect(copied: Path, tmp_path: Path
     assert answer.code == 0 and "ran 1 of" in answer.out
     assert nis() == pytest.approx(honest, rel=0.02)
     content = json.loads((out / "run.json").read_text())
-    assert content["provenance"]["model_update"] == {"gnss_latency": {"latency": 0.03}}
+    assert content["provenance"]["model_update"] == {"effects": {"gnss_latency": {"latency": 0.03}}}
 
 
 def test_a_model_update_reaches_every_stage_that_it_concerns(demo: Path, tmp_path: Path, tsmftis: Any) -> None:
@@ -159,7 +158,7 @@ def test_a_model_update_reaches_every_stage_that_it_concerns(demo: Path, tmp_pat
     }
     answer = tsmftis("run", demo, "--out", out, *line, "--model-update", update(tmp_path, effects))
     assert answer.code == 0, answer.err
-    content = json.loads((out / "run.json").read_text())["provenance"]["model_update"]
+    content = json.loads((out / "run.json").read_text())["provenance"]["model_update"]["effects"]
     assert content["thermal_hysteresis"] == {"half_width": 4.0, "gyro": [1e-7, -1e-7, 0.0], "accel": [0.0, 0.0, 0.0]}
     assert "half_width 4.00" in (out / "report.html").read_text()
     answer = tsmftis("run", demo, "--out", out, *line, "--model-update", update(tmp_path, effects | {"dem_bias": {}}))
@@ -175,10 +174,23 @@ def test_a_model_update_reaches_every_stage_that_it_concerns(demo: Path, tmp_pat
         np.testing.assert_allclose(stamps - d["time"].values, 1e-3, atol=1e-9)
 
 
-def test_a_stage_may_refuse_updates(tmp_path: Path) -> None:
-    path = update(tmp_path, {"camera_latency": {"latency": 0.007}})
-    with pytest.raises(InputError, match="takes no update yet"):
-        read_model_update(path, frozenset({"navigation"}))
+def test_an_update_is_read_as_it_was_written(tmp_path: Path) -> None:
+    given = ModelUpdate(
+        {"thermal_hysteresis": {"half_width": 6.0, "gyro": (1e-7, 0.0, -1e-7), "accel": (0.0, 0.0, 0.0)}},
+        {"mct": {"detector_nonlinearity": {"a": -0.015}}, "dtgs": {}},
+        (
+            {
+                "stage": "thermal",
+                "covariate": "time",
+                "unit": "rad s-1",
+                "table": {"covariate": [0, 9.5], "value": [0.0, 1e-7]},
+            },
+        ),
+    )
+    write_model_update(given, tmp_path / "update.yaml")
+    assert read_model_update(tmp_path / "update.yaml") == given
+    write_model_update(ModelUpdate(), tmp_path / "none.yaml")
+    assert (tmp_path / "none.yaml").read_text() == "format: tsmftis-model-update/1\neffects: {}\n"
 
 
 @pytest.mark.parametrize(
@@ -199,6 +211,19 @@ def test_a_stage_may_refuse_updates(tmp_path: Path) -> None:
         ({"thermal_lag": {"lag": -3}}, {}, ("thermal_lag.lag", "less than 0 s")),
         (["gnss_latency"], {}, ("effects", "holds no keys")),
         ({}, {"format": "other"}, ("format", "tsmftis-model-update/1")),
+        ({"learned:time": {}}, {}, ("effects.learned:time", "under learned")),
+        ({}, {"bench": [1]}, ("bench", "holds no keys")),
+        (
+            {},
+            {"bench": {"mct": {"detector_nonlinearity": {"b": 1.0}}}},
+            ("bench.mct.detector_nonlinearity.b", "no parameter"),
+        ),
+        ({}, {"learned": [{"stage": "thermal"}]}, ("learned[0]", "covariate, unit, table")),
+        (
+            {},
+            {"learned": [{"stage": "x", "covariate": "y", "unit": "1", "table": {"covariate": [1], "value": []}}]},
+            ("learned[0].table", "lists of one length"),
+        ),
         ({}, {"colour": 1}, ("colour", "not known")),
     ],
 )
