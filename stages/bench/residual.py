@@ -3,21 +3,17 @@
     r(σ) = √k·(B(σ; θ) − c·B_vendor(σ))/‖B(σ; 0)‖,        RMS of r = relative error after one scale
 
 Effects (docs/campaign-format.md): detector_nonlinearity, recorded u = v·(1 − a·v) with v relative to its own largest deviation;
-opd_scale, true OPD = (1 + scale)·stated; response_scale, which is the fitted scale's own and cannot be seen. A recorded signal is
-made linear either exactly, v = 2u/(1 + √(1 − 4a·u)), or as vendors do, v = u·(1 + a·u), which is the same to first order; of
-the two the one that meets the vendor's spectrum better is taken, the choice standing for the unknown third order.
+opd_scale, true OPD = (1 + scale)·stated; response_scale, which is the fitted scale's own and cannot be seen. Of the two
+inverses of a non-linearity (stages/bench/bench.py) the one that can meet the vendor's spectrum better is taken.
 
 Functions
 ---------
 residual_problem    of a bench record with a vendor's spectrum
-linearised          scans made linear
-met                 ‖s·B − B_vendor‖/‖B_vendor‖ with the effects taken out
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +22,7 @@ from scipy.optimize import minimize_scalar
 from pipeline.errors import InputError
 from pipeline.records import Bench
 from pipeline.residual_problem import Candidate, Parameter, Parameters, ResidualProblem
-from stages.bench.bench import BenchSettings, choose, corrected, find_zpd
+from stages.bench.bench import BenchSettings, choose, corrected, find_zpd, linear
 from tsmftis import fourier
 from tsmftis.effects import EFFECTS
 
@@ -41,26 +37,6 @@ STEP = {"detector_nonlinearity": 1e-3, "opd_scale": 1e-7, "response_scale": 1e-3
 LARGEST_A = 0.24  # beyond a quarter the recorded signal is no longer a function of the true one
 
 
-def linearised(scans: Array, a: float, exact: bool) -> Array:
-    """Scans (scan, n), free of their mean, with the non-linearity `a` taken out; each relative to its own largest deviation.
-
-    The largest deviation of the true signal is v = ±1, recorded there as ±1 − a (exact), which sets the scale of u.
-    """
-    if a == 0.0:
-        return scans
-    peak = np.take_along_axis(scans, np.argmax(np.abs(scans), axis=1)[:, None], axis=1)
-    if exact:
-        size = np.abs(peak) / (1.0 - a * np.sign(peak))
-        u = scans / size
-        v = 2.0 * u / (1.0 + np.sqrt(np.maximum(1.0 - 4.0 * a * u, 0.0)))
-    else:
-        size = np.abs(peak)
-        u = scans / size
-        v = u * (1.0 + a * u)
-    v = v * size
-    return v - v.mean(axis=1, keepdims=True)
-
-
 def _spectrum(
     bench: Bench,
     settings: BenchSettings,
@@ -73,9 +49,7 @@ def _spectrum(
     a = parameters.get("detector_nonlinearity", {}).get("a", 0.0)
     stretch = 1.0 + parameters.get("opd_scale", {}).get("scale", 0.0)
     options, _ = choose(bench, settings, zpd)
-    if stretch != 1.0:
-        options = replace(options, half_length=options.half_length * stretch)
-    made = corrected(linearised(scans, a, exact), bench.opd * stretch, zpd * stretch, wavenumber, options)
+    made = corrected(linear(scans, a, exact) if a else scans, bench.opd * stretch, zpd * stretch, wavenumber, options)
     return settings.normalisation_per_m * made.mean(axis=0)
 
 
@@ -177,11 +151,3 @@ def _is_exact(made: Maker, reference: Array) -> bool:
         )
         best[exact] = float(found.fun)
     return best[True] <= best[False]
-
-
-def met(bench: Bench, effects: Mapping[str, Mapping[str, float]], settings: BenchSettings | None = None) -> float:
-    """‖s·B − B_vendor‖/‖B_vendor‖ after one fitted scale s, on all wavenumbers, with `effects` taken out of the interferogram."""
-    wavenumber, r = _reference(bench)
-    made = _maker(bench, settings or BenchSettings(), wavenumber)
-    forms = (True, False) if effects.get("detector_nonlinearity", {}).get("a", 0.0) else (False,)
-    return min(_missed(made(effects, exact), r) for exact in forms)
