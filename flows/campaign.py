@@ -23,7 +23,7 @@ from prefect.task_runners import ThreadPoolTaskRunner
 from threadpoolctl import threadpool_limits
 
 from flows import steps
-from flows.steps import NEEDS, Plan
+from flows.steps import NEEDS, Plan, reaches
 from pipeline.errors import InputError, TsmftisError
 from pipeline.run_stage import StageRecord
 
@@ -52,15 +52,16 @@ def run_step(plan: Plan, stage: str, unit: str, before: list[StageRecord]) -> St
 
 
 @dataclass
-class _Graph:
+class Graph:
     """Tasks in the order of submission; each waits for those of the stages that its own needs, in its own unit or above it."""
 
     plan: Plan
+    upto: str | None = None  # only what this stage needs, and itself
     futures: list[Future] = field(default_factory=list)
     by_stage: dict[tuple[str, str], Future] = field(default_factory=dict)
 
     def submit(self, stage: str, unit: str) -> None:
-        if not self.plan.does(stage):
+        if not self.plan.does(stage) or not (self.upto is None or reaches(stage, self.upto)):
             return
         flight = unit.split("/")[0]
         waits = [self.by_stage.get((need, where)) for need in NEEDS[stage] for where in (unit, flight, "campaign")]
@@ -80,6 +81,17 @@ class _Graph:
             if self.plan.wants(flight, line.id):
                 self.line(flight, line.id)
 
+    def campaign(self) -> None:
+        keys = self.plan.opened.keys
+        if keys.thermal is not None:
+            self.submit("thermal", "campaign")
+        for flight in keys.flights:
+            if not self.plan.lines or any(self.plan.wants(flight.id, entry.id) for entry in flight.lines):
+                self.flight(flight.id)
+        for bench in keys.bench:
+            if not self.plan.lines:
+                self.submit("bench", bench.id)
+
     def results(self) -> list[StageRecord]:
         """Records in the order of submission, failed and skipped ones among them; the listener hears of each as it ends."""
         listener = _listener.get()
@@ -97,7 +109,7 @@ class _Graph:
 @flow(name="line", validate_parameters=False, persist_result=False)
 def line_flow(plan: Plan, flight: str, line: str) -> list[StageRecord]:
     """The stages of one line, on the flight's trajectory as it is."""
-    graph = _Graph(plan)
+    graph = Graph(plan)
     graph.line(flight, line)
     return graph.results()
 
@@ -105,7 +117,7 @@ def line_flow(plan: Plan, flight: str, line: str) -> list[StageRecord]:
 @flow(name="flight", validate_parameters=False, persist_result=False)
 def flight_flow(plan: Plan, flight: str) -> list[StageRecord]:
     """Navigation and the lines of one flight, on the thermal model as it is."""
-    graph = _Graph(plan)
+    graph = Graph(plan)
     graph.flight(flight)
     return graph.results()
 
@@ -113,44 +125,36 @@ def flight_flow(plan: Plan, flight: str) -> list[StageRecord]:
 @flow(name="campaign", validate_parameters=False, persist_result=False)
 def campaign_flow(plan: Plan) -> list[StageRecord]:
     """Thermal model, flights, lines and bench interferograms of a campaign."""
-    graph = _Graph(plan)
-    keys = plan.opened.keys
-    if keys.thermal is not None:
-        graph.submit("thermal", "campaign")
-    for flight in keys.flights:
-        if not plan.lines or any(plan.wants(flight.id, entry.id) for entry in flight.lines):
-            graph.flight(flight.id)
-    for bench in keys.bench:
-        if not plan.lines:
-            graph.submit("bench", bench.id)
+    graph = Graph(plan)
+    graph.campaign()
     return graph.results()
 
 
 def run_campaign(plan: Plan, listener: Listener | None = None, dask: str | None = None) -> list[StageRecord]:
     """Run the campaign flow; `listener` hears of each stage as it ends; `dask`: a scheduler's address, or "local"."""
-    return _run(campaign_flow, listener, dask, plan)
+    return run_flow(campaign_flow, listener, dask, plan)
 
 
 def run_flight(plan: Plan, flight: str, listener: Listener | None = None) -> list[StageRecord]:
     """Run the flight flow alone."""
-    return _run(flight_flow, listener, None, plan, flight)
+    return run_flow(flight_flow, listener, None, plan, flight)
 
 
 def run_line(plan: Plan, flight: str, line: str, listener: Listener | None = None) -> list[StageRecord]:
     """Run the line flow alone."""
-    return _run(line_flow, listener, None, plan, flight, line)
+    return run_flow(line_flow, listener, None, plan, flight, line)
 
 
-def _run(what: Any, listener: Listener | None, dask: str | None, *arguments: Any) -> list[StageRecord]:
+def run_flow(what: Any, listener: Listener | None, dask: str | None, *arguments: Any) -> Any:
+    """A flow on the embedded engine, or on Dask; what it returns."""
     runner: Any = ThreadPoolTaskRunner(max_workers=WORKERS) if dask is None else _dask_runner(dask)
     token = _listener.set(listener)
     try:
         # One thread a matrix product: rounding hangs on how a product is shared out, and two lines run at once anyway.
         with engine.quiet_engine(), threadpool_limits(limits=1):
-            records: list[StageRecord] = what.with_options(task_runner=runner)(*arguments)
+            return what.with_options(task_runner=runner)(*arguments)
     finally:
         _listener.reset(token)
-    return records
 
 
 def _dask_runner(address: str) -> Any:

@@ -13,6 +13,7 @@ from pipeline.errors import InputError
 from pipeline.yaml_file import load_yaml
 from stages.bench import BenchSettings
 from stages.budget import BudgetSettings
+from stages.closed_loop import LoopSettings
 from stages.mapping import MappingSettings
 from stages.navigation import NavigationSettings
 from stages.reconstruction import ReconstructionSettings
@@ -34,6 +35,7 @@ class Settings(BaseModel):
     mapping: MappingSettings = MappingSettings()
     bench: BenchSettings = BenchSettings()
     budget: BudgetSettings = BudgetSettings()
+    closed_loop: LoopSettings = LoopSettings()
 
 
 def load_settings(file: Path | None, assignments: list[str]) -> Settings:

@@ -94,16 +94,16 @@ class Plan:
         return {"force": self.start is not None and reaches(self.start, stage), "forbid": False}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Parameters and figures as JSON data."""
     if hasattr(value, "__dataclass_fields__"):
-        return {n: _plain(getattr(value, n)) for n in value.__dataclass_fields__}
+        return {n: plain(getattr(value, n)) for n in value.__dataclass_fields__}
     if hasattr(value, "model_dump"):
         return value.model_dump(mode="json")
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
@@ -113,14 +113,12 @@ def thermal_step(plan: Plan) -> StageRecord:
     keys = campaign.keys.thermal
     assert keys is not None
     names = [*keys.train, *keys.verify]
-    unit = campaign.instrument.imu
-    turn_on = None if unit is None else (unit.gyro.bias_sigma, unit.accel.bias_sigma)
 
     def work(to: Paths) -> dict[str, Any]:
         train, verify = ([campaign.chamber(n) for n in part] for part in (keys.train, keys.verify))
-        result = thermal.run(train, verify, plan.settings.thermal, turn_on, plan.effects("thermal"))
+        result = thermal.run(train, verify, plan.settings.thermal, turn_on(campaign), plan.effects("thermal"))
         write_dataset(result.model.to_dataset(), to["model"])
-        write_json(to["figures"], _plain(result.figures))
+        write_json(to["figures"], plain(result.figures))
         return {"verify": result.verification, "notes": list(result.notes)}
 
     return run_stage(
@@ -129,10 +127,10 @@ def thermal_step(plan: Plan) -> StageRecord:
         "campaign",
         ("stages.thermal",),
         {
-            "settings": _plain(plan.settings.thermal),
+            "settings": plain(plan.settings.thermal),
             "train": list(keys.train),
             "verify": list(keys.verify),
-            "turn_on": _plain(turn_on),
+            "turn_on": plain(turn_on(campaign)),
             "effects": plan.effects("thermal"),
         },
         {n: campaign.path(n) for n in names},
@@ -164,8 +162,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
     if update := plan.effects("navigation"):
         about["model_update"] = json.dumps(update, sort_keys=True)
     method = plan.settings.thermal.method
-    declared = campaign.keys.thermal is not None and _can_be_compensated(campaign, flight)
-    if compensated := declared and method != "none":
+    if compensated := compensation(plan, flight) != "none":
         inputs["model"] = _needed(model, "thermal")
         outputs["correction"] = f"{flight}/thermal.nc"
 
@@ -176,14 +173,14 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         if known is not None and imu.temperatures is not None:
             correction = known.correction(imu.temperatures, method, of=imu.time, where=inputs["imu"])
         assert instrument.imu is not None and instrument.mounting is not None
-        with _naming(gnss=inputs["gnss"], imu=inputs["imu"], **{"campaign.yaml": campaign.root / "campaign.yaml"}):
+        with naming(gnss=inputs["gnss"], imu=inputs["imu"], **{"campaign.yaml": campaign.root / "campaign.yaml"}):
             result = navigation.run(
                 imu,
                 campaign.gnss(flight),
                 instrument.imu,
                 instrument.mounting,
                 plan.settings.navigation,
-                initial=_initial(campaign, flight),
+                initial=initial_attitude(campaign, flight),
                 correction=correction,
                 effects=plan.effects("navigation"),
             )
@@ -205,14 +202,14 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         flight,
         ("stages.navigation", "stages.thermal", "pipeline.formats.sbet", "pipeline.formats.smrmsg"),
         {
-            "settings": _plain(plan.settings.navigation),
+            "settings": plain(plan.settings.navigation),
             "effects": plan.effects("navigation"),
             "thermal": method,
             "about": about,
-            "imu": _plain(instrument.imu),
-            "initial": _plain(entry.initial),
-            "antenna": _plain(instrument.mounting.imu_to_antenna if instrument.mounting else None),
-            "imu_to_body": _plain(instrument.mounting.imu_to_body if instrument.mounting else None),
+            "imu": plain(instrument.imu),
+            "initial": plain(entry.initial),
+            "antenna": plain(instrument.mounting.imu_to_antenna if instrument.mounting else None),
+            "imu_to_body": plain(instrument.mounting.imu_to_body if instrument.mounting else None),
         },
         inputs,
         outputs,
@@ -226,7 +223,7 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
     campaign = plan.opened
     entry, instrument = campaign.line(flight, line), campaign.instrument
     trajectory = plan.out / flight / "trajectory.nc"
-    effects = _of_camera(plan)
+    effects = of_camera(plan)
     inputs = {
         "trajectory": _needed(trajectory, "navigation"),
         "frames": campaign.path(entry.frames),
@@ -240,7 +237,7 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
     def work(to: Paths) -> dict[str, Any]:
         assert instrument.camera is not None and instrument.mounting is not None
         stamps = campaign.frames(flight, line).time
-        with _naming(**{n: inputs[n] for n in ("frames", "targets", "imu") if n in inputs}):
+        with naming(**{n: inputs[n] for n in ("frames", "targets", "imu") if n in inputs}):
             result = tracking.run(
                 Trajectory.from_file(trajectory),
                 stamps,
@@ -267,10 +264,10 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
         f"{flight}/{line}",
         ("stages.tracking", "pipeline.formats.table"),
         {
-            "settings": _plain(plan.settings.tracking),
+            "settings": plain(plan.settings.tracking),
             "effects": effects,
-            "camera": _plain(instrument.camera),
-            "mounting": _plain(instrument.mounting),
+            "camera": plain(instrument.camera),
+            "mounting": plain(instrument.mounting),
         },
         inputs,
         {
@@ -304,7 +301,7 @@ def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
             CameraPoses.from_file(inputs["poses"]),
             camera,
             plan.settings.registration,
-            _of_camera(plan),
+            of_camera(plan),
         )
         write_dataset(tracks.joined(followed).to_dataset(), to["tracks"])
         return dict(followed.notes)
@@ -315,9 +312,9 @@ def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
         f"{flight}/{line}",
         ("stages.registration",),
         {
-            "settings": _plain(plan.settings.registration),
-            "effects": _of_camera(plan),
-            "camera": _plain(camera),
+            "settings": plain(plan.settings.registration),
+            "effects": of_camera(plan),
+            "camera": plain(camera),
         },
         inputs,
         {"tracks": f"{flight}/{line}/tracks.nc"},
@@ -384,10 +381,10 @@ def reconstruction_step(plan: Plan, flight: str, line: str) -> StageRecord:
         f"{flight}/{line}",
         ("stages.reconstruction",),
         {
-            "settings": _plain(plan.settings.reconstruction),
+            "settings": plain(plan.settings.reconstruction),
             "effects": plan.effects("spectral"),
-            "camera": _plain(instrument.camera),
-            "interferometer": _plain(instrument.interferometer),
+            "camera": plain(instrument.camera),
+            "interferometer": plain(instrument.interferometer),
         },
         inputs,
         {n: f"{flight}/{line}/{n}.nc" for n in ("spectra", "products", "interferograms")},
@@ -461,10 +458,10 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
         f"{flight}/{line}",
         ("stages.mapping", "pipeline.raster"),
         {
-            "settings": _plain(settings),
+            "settings": plain(settings),
             "effects": effects,
-            "camera": _plain(instrument.camera),
-            "interferometer": _plain(instrument.interferometer),
+            "camera": plain(instrument.camera),
+            "interferometer": plain(instrument.interferometer),
         },
         inputs,
         {n: f"{flight}/{line}/{file}" for n, file in files.items()},
@@ -489,7 +486,7 @@ def scoring_step(plan: Plan, flight: str, line: str) -> StageRecord:
     def work(to: Paths) -> dict[str, Any]:
         with open_dataset(products) as d:
             contrast = dict(zip(map(str, d["target"].values), d["contrast"].values.tolist(), strict=True))
-        content: dict[str, Any] = _plain(scoring.run(Spectra.from_file(spectra), contrast))
+        content: dict[str, Any] = plain(scoring.run(Spectra.from_file(spectra), contrast))
         write_json(to["scores"], content)
         return content
 
@@ -512,7 +509,7 @@ def bench_step(plan: Plan, bench: str) -> StageRecord:
     entry = next(b for b in campaign.keys.bench if b.id == bench)
 
     def work(to: Paths) -> dict[str, Any]:
-        with _naming(bench=campaign.path(entry.file)):
+        with naming(bench=campaign.path(entry.file)):
             result = bench_stage.run(campaign.bench(bench), plan.settings.bench, plan.bench_effects(bench))
         write_dataset(result.to_dataset(), to["spectrum"])
         return {
@@ -527,7 +524,7 @@ def bench_step(plan: Plan, bench: str) -> StageRecord:
         "bench",
         bench,
         ("stages.bench",),
-        {"settings": _plain(plan.settings.bench), "effects": plan.bench_effects(bench)},
+        {"settings": plain(plan.settings.bench), "effects": plan.bench_effects(bench)},
         {"interferogram": campaign.path(entry.file)},
         {"spectrum": f"bench/{bench}.nc"},
         work,
@@ -541,18 +538,26 @@ def _needed(path: Path, stage: str) -> Path:
     return path
 
 
-def _of_camera(plan: Plan) -> Effects:
+def of_camera(plan: Plan) -> Effects:
     """Effects on camera and mounting: those of the geometry but the terrain's."""
     return {name: values for name, values in plan.effects("geometry").items() if name != "dem_bias"}
 
 
-def _can_be_compensated(campaign: Campaign, flight: str) -> bool:
-    """Whether a thermal correction is still to be taken off, and there are temperatures to make it of."""
-    imu = campaign.imu(flight)
-    return imu.temperatures is not None and imu.compensated_by is None
+def turn_on(campaign: Campaign) -> tuple[float, float] | None:
+    """Declared sigmas of what gyros [rad/s] and accelerometers [m/s²] are off by from one start to the next."""
+    unit = campaign.instrument.imu
+    return None if unit is None else (unit.gyro.bias_sigma, unit.accel.bias_sigma)
 
 
-def _initial(campaign: Campaign, flight: str) -> tuple[float, np.ndarray, np.ndarray] | None:
+def compensation(plan: Plan, flight: str) -> str:
+    """The method whose thermal correction is to be taken off a flight; "none" where there is none, or nothing to make it of."""
+    if plan.opened.keys.thermal is None:
+        return "none"
+    imu = plan.opened.imu(flight)
+    return "none" if imu.temperatures is None or imu.compensated_by is not None else plan.settings.thermal.method
+
+
+def initial_attitude(campaign: Campaign, flight: str) -> tuple[float, np.ndarray, np.ndarray] | None:
     keys = campaign.flight(flight).initial
     if keys is None:
         return None
@@ -564,7 +569,7 @@ def _initial(campaign: Campaign, flight: str) -> tuple[float, np.ndarray, np.nda
 
 
 @contextmanager
-def _naming(**files: Path) -> Iterator[None]:
+def naming(**files: Path) -> Iterator[None]:
     """Stages know records, not files: an InputError about a record is raised again with the file's name."""
     try:
         yield

@@ -10,15 +10,17 @@ Classes
 Parameter        one parameter of a candidate: its unit, what is believed of it, the step of its differences
 Candidate        an effect that the declared model may lack
 ResidualProblem  the residual with its nuisance, candidates, covariates, groups and noise blocks
+joined           several problems of one instrument as one
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -112,3 +114,37 @@ class ResidualProblem:
         names = [c.effect for c in self.candidates]
         if len(set(names)) != len(names):
             raise ValueError(f"{self.stage}: a candidate is named twice: {', '.join(names)}")
+
+
+def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
+    """Problems of one instrument under one set of parameters, by name (a flight's), one after the other.
+
+    Groups, series, channels and nuisance are each problem's own; candidates, sigma and floor those of the first; covariates those
+    that all have. A single problem stays as it is.
+    """
+    parts = list(problems.values())
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    own: dict[str, list[Labels]] = {"group": [], "series": [], "channel": []}
+    names: dict[int, str] = {}
+    for name, part in problems.items():
+        channel = np.zeros(part.group.size, int) if part.channel is None else part.channel
+        for kind, labels in (("group", part.group), ("series", part.series), ("channel", channel)):
+            _, new = np.unique(labels, return_inverse=True)
+            start = 1 + int(own[kind][-1].max()) if own[kind] else 0
+            own[kind].append(new + start)
+        for old, new_label in zip(part.group.tolist(), own["group"][-1].tolist(), strict=True):
+            names[new_label] = f"{name} {part.group_names.get(old, old)}"
+    shared = [k for k in first.covariates if all(k in part.covariates for part in parts)]
+    return replace(
+        first,
+        residual=lambda parameters: np.concatenate([part.residual(parameters) for part in parts]),
+        group=np.concatenate(own["group"]),
+        series=np.concatenate(own["series"]),
+        channel=np.concatenate(own["channel"]),
+        time=np.concatenate([part.time for part in parts]),
+        nuisance=block_diag(*(part.nuisance for part in parts)),
+        covariates={k: np.concatenate([part.covariates[k] for part in parts]) for k in shared},
+        group_names=names,
+    )

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from flows.cli import budgeting, compensating, exporting, importing, inspecting, running, settings, simulating
+from flows.cli import budgeting, closing, compensating, exporting, importing, inspecting, running, settings, simulating
 from pipeline.errors import TsmftisError
 from tsmftis import __version__
 
@@ -23,6 +23,7 @@ app = typer.Typer(
 app.command("inspect")(inspecting.inspect)
 app.command("run")(running.run)
 app.command("budget")(budgeting.budget)
+app.command("close-loop")(closing.close_loop)
 app.command("settings")(settings.settings)
 app.command("simulate")(simulating.simulate)
 app.add_typer(importing.app, name="import")

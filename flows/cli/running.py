@@ -166,10 +166,10 @@ def told(update: ModelUpdate) -> list[str]:
     return said
 
 
-def belongs(plan: Plan, name: str, out: Path) -> None:
+def belongs(plan: Plan, name: str, out: Path, kept: str = "run.json") -> None:
     """A folder holds the results of one campaign: another's would be overwritten where ids are alike, and mixed elsewhere."""
     try:
-        before = json.loads((plan.out / "run.json").read_text(encoding="utf-8")).get("campaign")
+        before = json.loads((plan.out / kept).read_text(encoding="utf-8")).get("campaign")
     except (OSError, ValueError):
         return
     if before != name:

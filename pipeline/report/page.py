@@ -20,7 +20,7 @@ from pipeline.records import LADDER, Interferograms, Spectra, ThermalCorrection,
 from pipeline.report import figures, maps
 
 
-class _Figures:
+class Numbered:
     """Numbers the figures, so that the page's bytes do not hang on random identifiers."""
 
     def __init__(self) -> None:
@@ -42,9 +42,9 @@ def write_report(
     campaign: Campaign, out: Path, run: dict[str, Any], settings: dict[str, Any], warnings: list[str]
 ) -> Path:
     """Write `out`/report.html for what `run` (the content of run.json) lists; returns its path."""
-    draw = _Figures()
+    draw = Numbered()
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["figure"] = _significant
+    environment.filters["figure"] = significant
     template = environment.from_string(files("pipeline.report").joinpath("page.html").read_text(encoding="utf-8"))
     content = template.render(
         run=run,
@@ -64,7 +64,7 @@ def write_report(
     return path
 
 
-def _significant(value: Any, digits: int = 3) -> str:
+def significant(value: Any, digits: int = 3) -> str:
     """A number for a table: `digits` significant ones, a dash for none."""
     if value is None:
         return "–"
@@ -74,7 +74,7 @@ def _significant(value: Any, digits: int = 3) -> str:
     return f"{value:#.{digits}g}".rstrip(".")
 
 
-def _thermal(out: Path, run: dict[str, Any], draw: _Figures) -> dict[str, Any] | None:
+def _thermal(out: Path, run: dict[str, Any], draw: Numbered) -> dict[str, Any] | None:
     path = out / "thermal_figures.json"
     if not run.get("thermal") or not path.exists():
         return None
@@ -87,7 +87,7 @@ def _thermal(out: Path, run: dict[str, Any], draw: _Figures) -> dict[str, Any] |
     return {"figures": shown, "verify": run["thermal"]["verify"], "notes": run["thermal"].get("notes", [])}
 
 
-def _flight(campaign: Campaign, out: Path, flight: str, run: dict[str, Any], draw: _Figures) -> dict[str, Any]:
+def _flight(campaign: Campaign, out: Path, flight: str, run: dict[str, Any], draw: Numbered) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "id": flight,
         "navigation": run["flights"][flight].get("navigation"),
@@ -119,7 +119,7 @@ def _flight(campaign: Campaign, out: Path, flight: str, run: dict[str, Any], dra
 
 
 def _line(
-    campaign: Campaign, out: Path, flight: str, line: str, scores: dict[str, Any], draw: _Figures
+    campaign: Campaign, out: Path, flight: str, line: str, scores: dict[str, Any], draw: Numbered
 ) -> dict[str, Any]:
     folder = out / flight / line
     entry: dict[str, Any] = {
@@ -153,7 +153,7 @@ def _line(
     return entry
 
 
-def _bench(out: Path, bench: str, run: dict[str, Any], draw: _Figures) -> dict[str, Any]:
+def _bench(out: Path, bench: str, run: dict[str, Any], draw: Numbered) -> dict[str, Any]:
     entry: dict[str, Any] = {"id": bench, "summary": run["bench"][bench], "figure": None}
     path = out / "bench" / f"{bench}.nc"
     if path.exists():

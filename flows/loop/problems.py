@@ -1,0 +1,223 @@
+"""Which parts of a campaign the loop can look at, and what it is given of each: files in, a residual problem out.
+
+Parts come in the order of processing, since what one lacks shows in the residuals of those behind it. A part reads what the
+stages before it left in the plan's folder, made with the effects that were found so far (`plan.update`).
+
+Functions
+---------
+parts_of      the parts that a campaign has data for, and why others are missing
+inputs_of     files that a part is made of
+problem_of    its residual problem
+settings_of   the settings that it hangs on
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flows.steps import Plan, compensation, initial_attitude, naming, of_camera, plain, turn_on
+from pipeline.raster import Dem
+from pipeline.records import Tracks, Trajectory
+from pipeline.residual_problem import ResidualProblem, joined
+from stages import bench, navigation, reconstruction, registration, thermal, tracking
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stage as loop.json names it; `bench`: the laboratory interferogram that it is about, if it is one."""
+
+    stage: str
+    bench: str | None = None
+
+    @property
+    def name(self) -> str:
+        return self.stage if self.bench is None else f"bench-{self.bench}"
+
+    @property
+    def needs(self) -> str | None:
+        """The last stage of a run whose results it reads."""
+        if self.bench is not None:
+            return None
+        return {"navigation": "thermal", "geometry": "navigation", "spectral": "tracking"}.get(self.stage)
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """The code that its problem comes from."""
+        if self.bench is not None:
+            return ("stages.bench",)
+        return {
+            "thermal": ("stages.thermal",),
+            "navigation": ("stages.navigation", "stages.thermal"),
+            "geometry": ("stages.tracking", "stages.registration", "pipeline.raster"),
+            "spectral": ("stages.reconstruction",),
+        }[self.stage]
+
+
+def parts_of(plan: Plan) -> tuple[list[Part], dict[str, str]]:
+    """Parts in the order of processing, and for those that are missing why."""
+    keys, instrument = plan.opened.keys, plan.opened.instrument
+    lines = any(f.lines for f in keys.flights)
+    has = {
+        "thermal": (keys.thermal is not None, "the campaign has no chamber run"),
+        "navigation": (bool(keys.flights), "the campaign has no flight"),
+        "geometry": (lines, "no flight has a line"),
+        "spectral": (lines and keys.references is not None, "there are no lines with reference spectra"),
+    }
+    assert not lines or instrument.camera is not None
+    parts = [Part(stage) for stage, (there, _) in has.items() if there]
+    missing = {stage: why for stage, (there, why) in has.items() if not there}
+    for entry in keys.bench:
+        if plan.opened.bench(entry.id).reference is None:
+            missing[f"bench-{entry.id}"] = "there is no reference spectrum to hold it against"
+        else:
+            parts.append(Part("spectral", entry.id))
+    return parts, missing
+
+
+def lines_of(plan: Plan) -> list[tuple[str, str]]:
+    return [(f.id, entry.id) for f in plan.opened.keys.flights for entry in f.lines]
+
+
+def inputs_of(plan: Plan, part: Part) -> dict[str, Path]:
+    """Files by name, campaign's and run's."""
+    campaign = plan.opened
+    keys = campaign.keys
+    named = {"instrument": campaign.path(keys.instrument)}
+    if part.bench is not None:
+        entry = next(b for b in keys.bench if b.id == part.bench)
+        return {"interferogram": campaign.path(entry.file)}
+    if part.stage == "thermal":
+        assert keys.thermal is not None
+        return named | {name: campaign.path(name) for name in (*keys.thermal.train, *keys.thermal.verify)}
+    for flight in keys.flights:
+        named[f"{flight.id}/imu"] = campaign.path(flight.imu)
+        if part.stage == "navigation":
+            named[f"{flight.id}/gnss"] = campaign.path(flight.gnss)
+            if compensation(plan, flight.id) != "none":
+                named[f"{flight.id}/thermal"] = plan.out / "thermal_model.nc"
+        for line in flight.lines if part.stage != "navigation" else ():
+            unit = f"{flight.id}/{line.id}"
+            named |= {f"{unit}/frames": campaign.path(line.frames), f"{unit}/targets": campaign.path(line.targets)}
+            if part.stage == "geometry":
+                named[f"{flight.id}/trajectory"] = plan.out / flight.id / "trajectory.nc"
+                if line.gcps is not None:
+                    named[f"{unit}/gcps"] = campaign.path(line.gcps)
+            else:
+                named[f"{unit}/tracks"] = plan.out / unit / "pos_tracks.nc"
+    if part.stage == "geometry" and keys.dem is not None:
+        named["dem"] = campaign.path(keys.dem)
+    if part.stage == "spectral":
+        named |= {
+            "calibration": campaign.path(keys.calibration or ""),
+            "references": campaign.path(keys.references or ""),
+        }
+    return named
+
+
+def settings_of(plan: Plan, part: Part) -> dict[str, Any]:
+    settings = plan.settings
+    if part.bench is not None:
+        return plain(settings.bench)
+    groups: Mapping[str, tuple[Any, ...]] = {
+        "thermal": (settings.thermal,),
+        "navigation": (settings.navigation, settings.thermal.method),
+        "geometry": (settings.tracking, settings.registration),
+        "spectral": (settings.reconstruction,),
+    }
+    return {"settings": plain(groups[part.stage])}
+
+
+def problem_of(plan: Plan, part: Part) -> ResidualProblem:
+    """The part's residual problem; InputError where its files cannot serve."""
+    if part.bench is not None:
+        with naming(bench=inputs_of(plan, part)["interferogram"]):
+            return bench.residual_problem(plan.opened.bench(part.bench), plan.settings.bench)
+    makers: Mapping[str, Callable[[Plan], ResidualProblem]] = {
+        "thermal": _thermal,
+        "navigation": _navigation,
+        "geometry": _geometry,
+        "spectral": _spectral,
+    }
+    return makers[part.stage](plan)
+
+
+def _thermal(plan: Plan) -> ResidualProblem:
+    keys = plan.opened.keys.thermal
+    assert keys is not None
+    train, verify = ([plan.opened.chamber(n) for n in part] for part in (keys.train, keys.verify))
+    return thermal.residual_problem(train, verify, plan.settings.thermal, turn_on(plan.opened), plan.effects("thermal"))
+
+
+def _navigation(plan: Plan) -> ResidualProblem:
+    campaign = plan.opened
+    instrument = campaign.instrument
+    assert instrument.imu is not None and instrument.mounting is not None
+    problems = {}
+    for flight in campaign.keys.flights:
+        imu, method = campaign.imu(flight.id), compensation(plan, flight.id)
+        correction = None
+        if method != "none" and imu.temperatures is not None:
+            known = thermal.ThermalModel.from_file(plan.out / "thermal_model.nc")
+            correction = known.correction(imu.temperatures, method, of=imu.time, where=campaign.path(flight.imu))
+        files = {"gnss": campaign.path(flight.gnss), "imu": campaign.path(flight.imu)}
+        with naming(**files, **{"campaign.yaml": campaign.root / "campaign.yaml"}):
+            problems[flight.id] = navigation.residual_problem(
+                imu,
+                campaign.gnss(flight.id),
+                instrument.imu,
+                instrument.mounting,
+                plan.settings.navigation,
+                initial=initial_attitude(campaign, flight.id),
+                correction=correction,
+                effects=plan.effects("navigation"),
+            )
+    return joined(problems)
+
+
+def _geometry(plan: Plan) -> ResidualProblem:
+    campaign = plan.opened
+    camera, mounting = campaign.instrument.camera, campaign.instrument.mounting
+    assert camera is not None and mounting is not None
+    dem = None if campaign.keys.dem is None else Dem.from_file(campaign.path(campaign.keys.dem))
+    lines = []
+    for flight, line in lines_of(plan):
+        frames = campaign.frames(flight, line)
+        lines.append(
+            tracking.GeometryLine(
+                f"{flight}/{line}",
+                Trajectory.from_file(plan.out / flight / "trajectory.nc"),
+                frames.time,
+                campaign.targets(flight, line),
+                campaign.gcps(flight, line),
+                registration.image_motion(frames, camera, plan.settings.registration, of_camera(plan)),
+                campaign.imu(flight).temperatures,
+            )
+        )
+    return tracking.residual_problem(lines, dem, camera, mounting, plan.settings.tracking, plan.effects("geometry"))
+
+
+def _spectral(plan: Plan) -> ResidualProblem:
+    campaign = plan.opened
+    camera, interferometer = campaign.instrument.camera, campaign.instrument.interferometer
+    assert camera is not None and interferometer is not None
+    lines = [
+        reconstruction.SpectralLine(
+            campaign.frames(flight, line),
+            Tracks.from_file(plan.out / flight / line / "pos_tracks.nc").only("tracking"),
+            campaign.targets(flight, line),
+            f"{flight}/{line}",
+        )
+        for flight, line in lines_of(plan)
+    ]
+    return reconstruction.residual_problem(
+        lines,
+        campaign.calibration(),
+        campaign.references(),
+        camera,
+        interferometer,
+        plan.settings.reconstruction,
+        plan.effects("spectral"),
+    )
