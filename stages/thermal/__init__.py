@@ -2,6 +2,7 @@
 
 run(train, verify, settings) → ThermalResult;   result.model.correction(temperatures) → what to take off a flight
 verify_run(model, chamber, seconds) → what is left of one run;   verification_table(runs) → figures of several
+residual_problem(train, verify, settings) → what the closed loop is offered
 """
 
 from __future__ import annotations
@@ -16,11 +17,20 @@ from pipeline.errors import InputError
 from pipeline.records import Chamber
 from stages.thermal.memory import Memory
 from stages.thermal.model import ThermalModel
+from stages.thermal.residual import residual_problem
 from stages.thermal.settings import ThermalSettings
 from stages.thermal.training import fit_model
 from stages.thermal.verification import verification_table, verify_run
 
-__all__ = ["ThermalModel", "ThermalResult", "ThermalSettings", "run", "verification_table", "verify_run"]
+__all__ = [
+    "ThermalModel",
+    "ThermalResult",
+    "ThermalSettings",
+    "residual_problem",
+    "run",
+    "verification_table",
+    "verify_run",
+]
 
 
 @dataclass(frozen=True)

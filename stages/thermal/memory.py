@@ -8,6 +8,8 @@ begins at T; y begins at T too.
 Classes and functions
 ---------------------
 Memory      h, A and τ of a unit
+means       mean temperatures that the play follows
+behind      how far the play is behind them, in half widths
 play        backlash operator
 lagged      first-order lag
 
@@ -19,7 +21,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numba
@@ -71,14 +73,23 @@ class Memory:
         """What the play adds to the biases of the six channels (n, 6) at times (n,) [s], of smoothed readings."""
         if not self.plays:
             return np.zeros((len(at), 6))
-        time = temperatures.time
-        step = smoothing_s / STEPS_PER_TIME_CONSTANT
-        if float(np.median(np.diff(time))) < 0.5 * step:
-            time = np.linspace(time[0], time[-1], int(np.ceil((time[-1] - time[0]) / step)) + 1)
-        mean = replace(self, lag=0.0).felt(temperatures)
-        mean, _ = smoothed(temperatures.time, mean, time, smoothing_s, causal)
-        behind = (play(mean, self.half_width) - mean) / self.half_width * [*self.gyro, *self.accel]
-        return np.stack([np.interp(at, time, column) for column in behind.T], -1)
+        time, mean = means(temperatures, smoothing_s, causal)
+        return behind(time, mean, self.half_width, at) * [*self.gyro, *self.accel]
+
+
+def means(temperatures: Temperatures, smoothing_s: float, causal: bool = False) -> tuple[Array, Array]:
+    """Times (m,) and smoothed mean temperature of the six channels' thermometers (m, 6) there, which the play follows."""
+    time = temperatures.time
+    step = smoothing_s / STEPS_PER_TIME_CONSTANT
+    if float(np.median(np.diff(time))) < 0.5 * step:
+        time = np.linspace(time[0], time[-1], int(np.ceil((time[-1] - time[0]) / step)) + 1)
+    return time, smoothed(temperatures.time, Memory().felt(temperatures), time, smoothing_s, causal)[0]
+
+
+def behind(time: Array, mean: Array, half_width: float, at: Array) -> Array:
+    """(play(T; h) − T)/h of temperatures (m, q) at times (m,), at times (n,): (n, q)."""
+    values = (play(mean, half_width) - mean) / half_width
+    return np.stack([np.interp(at, time, column) for column in values.T], -1)
 
 
 def _three(values: Any) -> Three:
