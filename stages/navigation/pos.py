@@ -313,6 +313,12 @@ def _shifted(start: Start, solution: Solution) -> Start:
     )
 
 
+def settled_start(solution: Solution) -> Start:
+    """The start of a further pass: moved to where the smoother has it, unless the flight says nothing of its heading."""
+    start = solution.problem.start
+    return start if _heading_is_unknown(start, solution) else _shifted(start, solution)
+
+
 def _heading_is_unknown(start: Start, solution: Solution) -> bool:
     """Whether the flight tells the start's heading no better than to half of what was known of it before."""
     smoothed = output.sigmas(solution.smoothed.covariance[:1], solution.store.epoch_dcm[:1])[0, 8]

@@ -3,11 +3,13 @@
 Functions
 ---------
 solve               filter and smoother
-likelihood, misfit  the filter alone over the first part of a flight: how well it explains the fixes
+forward             the filter alone
+likelihood, misfit  … over the first part of a flight: how well it explains the fixes
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -181,21 +183,36 @@ def _unit(problem: Problem, gap: NDArray[np.bool_]) -> kalman.Unit:
     return kalman.Unit(imu.time, imu.gyro, imu.accel, gap, still, lacking, noise, still_noise, 1.0 / tau)
 
 
-def _filter(problem: Problem) -> tuple[Gathered, NDArray[np.bool_], int, kalman.Store]:
+def forward(
+    problem: Problem, watched: Collection[str] = (), refused: NDArray[np.bool_] | None = None
+) -> tuple[Gathered, NDArray[np.bool_], int, kalman.Store]:
+    """The filter: measurements, gaps, number of epochs and what it leaves behind.
+
+    watched: groups of parameters that are carried as exactly known, so that the estimate is as if they were not, and the store
+    holds their part of Φ and H too. refused: fixes (n,) that are not used; all others are believed then, whatever they say.
+    """
     imu, settings, start = problem.imu, problem.settings, problem.start
     gathered = gather(imu, problem.gnss, problem.still, problem.latency, settings)
     gap = gaps(imu.time)
     unit = _unit(problem, gap)
-    active = problem.active
+    active = states.estimated({*settings.estimate, *watched})
+    known = np.setdiff1d(active, problem.active)
+    for noise in (unit.noise, unit.still_noise):
+        noise[known] = 0.0
     measurements = gathered.measurements
     inside = int(((measurements.time >= imu.time[0]) & (measurements.time <= imu.time[-1])).sum())
     changes = int(np.count_nonzero(np.diff(unit.still)))
     size = inside + int(np.ceil((imu.time[-1] - imu.time[0]) / settings.epoch_s)) + 2 * int(gap.sum()) + changes + 2
     store = kalman.Store.empty(imu.time.size, size, measurements.time.size, active.size)
     gates = np.array([0.0] + [chi2.isf(settings.gate_probability, m) for m in range(1, 7)])
+    if refused is not None:
+        measurements.use[gathered.of_fix[refused]] = False
+        gates[:] = np.inf
     theta = problem.theta.copy()
     lever = theta[states.parameter("antenna_lever_arm")]
     theta[states.parameter("gnss_latency")] -= problem.latency
+    P0 = initial_covariance(start, problem.model, settings, lever)
+    P0[known], P0[:, known] = 0.0, 0.0
     count = kalman.forward(
         unit,
         measurements,
@@ -204,7 +221,7 @@ def _filter(problem: Problem) -> tuple[Gathered, NDArray[np.bool_], int, kalman.
         start.velocity.copy(),
         dcm_to_quaternion(rpy_to_dcm(*start.rpy)),
         theta,
-        initial_covariance(start, problem.model, settings, lever)[np.ix_(active, active)],
+        P0[np.ix_(active, active)],
         settings.epoch_s,
         gates,
         settings.reentry_s,
@@ -221,13 +238,13 @@ def _until(problem: Problem, until: float) -> Problem:
 
 def likelihood(problem: Problem, until: float) -> float:
     """Σ −½(min(NIS, gate) + ln det S) over the fixes up to `until` [s]: how well a start explains them."""
-    _, _, _, store = _filter(_until(problem, until))
+    _, _, _, store = forward(_until(problem, until))
     return float(store.loglike.sum())
 
 
 def misfit(problem: Problem, until: float) -> tuple[float, float]:
     """Σ min(NIS, gate) over the fixes up to `until` [s], and its expectation Σ m."""
-    gathered, _, _, store = _filter(_until(problem, until))
+    gathered, _, _, store = forward(_until(problem, until))
     measurements = gathered.measurements
     counted = np.isfinite(store.nis) & measurements.use & (measurements.kind == kalman.FIX)
     gate = np.array([chi2.isf(problem.settings.gate_probability, m) for m in measurements.size[counted]])
@@ -236,7 +253,7 @@ def misfit(problem: Problem, until: float) -> tuple[float, float]:
 
 def solve(problem: Problem) -> Solution:
     """Filter and smoother over the whole flight."""
-    gathered, gap, count, store = _filter(problem)
+    gathered, gap, count, store = forward(problem)
     chosen = np.unique(np.linspace(0, count - 1, min(HISTORY, count)).astype(np.int64))
     smoothed = kalman.Smoothed.empty(count, problem.active.size, chosen)
     kalman.backward(count, problem.active, store, smoothed)

@@ -1,0 +1,331 @@
+"""What the closed loop is offered of a flight: the filter's innovations, whitened, as a function of the effects in its model.
+
+    r = S^(−½)·y,      e⁻ = Φ·e,   y = H·e⁻ + noise,   e = (1 − K·H)·e⁻,      ∂y/∂θ = −H·∂e⁻/∂θ_true
+
+y (six or three a fix) are the innovations of the forward filter, S their covariance, e true minus estimated state. A constant
+parameter that the model has wrong by δ starts e at δ in its place, and the filter's own recursion carries it into all later
+innovations: one pass gives the residual at θ and all its derivatives there. The root is symmetric (of the correlations, after
+division by the sigmas), so that each whitened component stays with its own axis.
+
+The null is the filter with the states that it has by default: what it can take up (biases; scale factors within their declared
+sigmas) is no residual, and an effect shows as far as the declared sigmas do not cover it. Lever arm, latency and g-sensitivity
+are no states of it, whatever the settings estimate: whether they are needed is what the loop decides.
+
+Start, linearisation and outliers must not depend on the effect that is looked for. They come from a smoothed run that estimates
+every candidate with a wide prior; fixes that even that run refuses are left out, all others are believed by every pass. The
+start's position and velocity are left open, since an arm or a latency shifts them.
+
+Functions
+---------
+residual_problem    of one flight
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.records import Gnss, Imu, ThermalCorrection
+from pipeline.residual_problem import Candidate, Parameter, Parameters, ResidualProblem
+from stages.navigation import kalman, states
+from stages.navigation.measurements import withheld
+from stages.navigation.pos import declared, settled_start, smooth
+from stages.navigation.settings import NavigationSettings
+from stages.navigation.solve import Problem, Solution, forward
+from stages.navigation.states import NAVIGATION
+from tsmftis.camera import Mounting
+from tsmftis.effects import EFFECTS
+from tsmftis.geodesy import STANDARD_GRAVITY
+from tsmftis.inertial import DEG_PER_H, ImuModel
+from tsmftis.rotation import dcm_to_rpy, quaternion_to_dcm
+
+Array = NDArray[np.float64]
+
+CANDIDATES = ("antenna_lever_arm", "gnss_latency", "gyro_scale_factor", "accel_scale_factor", "gyro_g_sensitivity")
+DECIDED_HERE = ("antenna_lever_arm", "gnss_latency", "gyro_g_sensitivity")  # never states of the null
+MARGIN = EFFECTS["gnss_latency"].largest["latency"]  # s at both ends, from which a latency could carry a fix out of the data
+OPEN_POSITION, OPEN_VELOCITY = 30.0, 1.0  # m, m/s: the start's sigmas
+WIDER = 20.0  # times the declared sigmas of scale factors: the prior of the run that the start is taken from
+WIDE_ARM, WIDE_LATENCY = 1.0, 0.5  # m, s: the same
+SIGMAS = 5.0  # of the declared scale factor's: a size worth naming
+MINUTE, SHORTEST, GROUPS = 60.0, 15.0, 8  # s, s: what is held out is a minute, or an eighth of a shorter flight
+FEWEST_FIXES = 20
+KEPT = 8  # linearisations in memory
+NEAR = 2.0  # steps of the differences: within them the derivatives serve
+COMPONENTS = ("north", "east", "down", "north velocity", "east velocity", "down velocity")
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """At θ (13,): r (n,) and S = −∂r/∂θ (n, 13)."""
+
+    theta: Array
+    residual: Array
+    signatures: Array
+
+
+@dataclass
+class Innovations:
+    """Whitened innovations of the chosen fixes (k,) as a function of θ; passes are kept.
+
+    `steps` (13,): of the differences; within NEAR of them from a point where the filter was run, that run's derivatives serve.
+    """
+
+    null: Problem
+    refused: NDArray[np.bool_]
+    chosen: NDArray[np.int64]
+    order: tuple[tuple[str, str], ...]
+    steps: Array
+    kept: OrderedDict[bytes, Linearisation] = field(default_factory=OrderedDict)
+
+    def __call__(self, parameters: Parameters) -> Array:
+        at = np.array([parameters.get(effect, {}).get(name, 0.0) for effect, name in self.order])
+        near = self._near(at)
+        return np.asarray(near.residual - near.signatures @ (at - near.theta))
+
+    def _near(self, at: Array) -> Linearisation:
+        distance = {key: float(np.max(np.abs(at - one.theta) / self.steps)) for key, one in self.kept.items()}
+        nearest = min(distance, key=lambda key: distance[key], default=None)
+        if nearest is not None and distance[nearest] <= NEAR:
+            self.kept.move_to_end(nearest)
+            return self.kept[nearest]
+        made = self.at(at)
+        self.kept[at.tobytes()] = made
+        if len(self.kept) > KEPT:
+            self.kept.popitem(last=False)
+        return made
+
+    def at(self, at: Array) -> Linearisation:
+        """The filter, run at θ."""
+        theta = self.null.theta.copy()
+        for (effect, name), value in zip(self.order, at, strict=True):
+            theta[states.parameter(effect).start + list(EFFECTS[effect].units).index(name)] += value
+        problem = replace(self.null, theta=theta, latency=float(theta[states.parameter("gnss_latency")][0]))
+        gathered, _, count, store = forward(problem, DECIDED_HERE, self.refused)
+        active = states.estimated({*problem.settings.estimate, *DECIDED_HERE})
+        begun = np.zeros((active.size, len(self.order)))
+        for column, (effect, name) in enumerate(self.order):
+            place = states.GROUPS[effect].start + list(EFFECTS[effect].units).index(name)
+            begun[np.searchsorted(active, place), column] = 1.0
+        carried = np.zeros((store.rows.size, 6, len(self.order)))
+        _carry(count, active, store, begun, carried)
+        fixes = gathered.of_fix[self.chosen]
+        m = int(gathered.measurements.size[fixes[0]])
+        root = _roots(store.S_inv[fixes, :m, :m])
+        y = np.einsum("kij,kj->ik", root, store.y[fixes, :m])
+        s = np.einsum("kij,kjq->ikq", root, carried[fixes, :m])
+        return Linearisation(at, y.ravel(), s.reshape(y.size, -1))
+
+
+@numba.njit(cache=True, nogil=True)
+def _carry(count, active, store, error, out):  # type: ignore[no-untyped-def]
+    """H·e⁻ (m, 6, q) at every measurement for errors (n, q) at the start, by the filter's own Φ, H and K; `error` is used up."""
+    n = active.size
+    for e in range(1, count):
+        phi, decay = store.epoch_phi[e - 1], store.epoch_decay[e - 1]
+        moved = phi @ error
+        for j in range(NAVIGATION, n):
+            s = active[j] - NAVIGATION
+            if s < 6:
+                error[j] *= decay[s]
+        error[:NAVIGATION] = moved
+        at = store.epoch_measurement[e]
+        if at >= 0:
+            m = store.rows[at]
+            shown = np.ascontiguousarray(store.H[at, :m]) @ error
+            out[at, :m] = shown
+            error -= np.ascontiguousarray(store.K[at, :, :m]) @ shown
+
+
+def _roots(inverse: Array) -> Array:
+    """Symmetric whitening (k, m, m) of covariances, given by their inverses: (correlations)^(−½)·(sigmas)^(−1)."""
+    covariance = np.linalg.inv(inverse)
+    sigma = np.sqrt(np.einsum("kii->ki", covariance))
+    values, vectors = np.linalg.eigh(covariance / (sigma[:, :, None] * sigma[:, None, :]))
+    return np.asarray(
+        np.einsum("kij,kj,klj,kl->kil", vectors, 1.0 / np.sqrt(np.maximum(values, 1e-12)), vectors, 1.0 / sigma)
+    )
+
+
+def residual_problem(
+    imu: Imu,
+    gnss: Gnss,
+    model: ImuModel,
+    mounting: Mounting,
+    settings: NavigationSettings,
+    *,
+    initial: tuple[float, Array, Array] | None = None,
+    correction: ThermalCorrection | None = None,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
+) -> ResidualProblem:
+    """Of one flight; the arguments are those of `run`. Candidates are relative to the declared model with `effects` in it.
+
+    Raises InputError as `run` does, and where too few fixes are left.
+    """
+    effects = effects or {}
+    temperature = _temperature(imu)
+    solution = _widely_estimated(imu, gnss, model, mounting, settings, initial, correction, effects)
+    theta = declared(mounting, effects)
+    estimate = tuple(g for g in settings.estimate if g not in DECIDED_HERE)
+    start = settled_start(solution)
+    null = replace(
+        solution.problem,
+        model=model,
+        settings=settings.model_copy(update={"estimate": estimate}),
+        start=replace(
+            start,
+            sigma_position=np.hypot(start.sigma_position, OPEN_POSITION),
+            sigma_velocity=np.hypot(start.sigma_velocity, OPEN_VELOCITY),
+        ),
+        declared=theta,
+        theta=theta,
+        latency=float(theta[states.parameter("gnss_latency")][0]),
+    )
+    refused = _refused(solution)
+    chosen = _chosen(solution, refused)
+    if chosen.size < FEWEST_FIXES:
+        raise InputError(
+            "gnss",
+            "variable 'time'",
+            f"leaves {chosen.size} usable fixes that are {MARGIN:g} s inside the inertial data",
+            f"innovations can be judged from {FEWEST_FIXES} fixes on",
+        )
+    candidates = _candidates(model, settings)
+    order = tuple((c.effect, name) for c in candidates for name in c.parameters)
+    steps = np.array([c.parameters[name].difference for c in candidates for name in c.parameters])
+    innovations = Innovations(null, refused, chosen, order, steps)
+    count = innovations({}).size // chosen.size
+    time = gnss.time[chosen]
+    group, names = _groups(time)
+    component = np.repeat(np.arange(count), chosen.size)
+    return ResidualProblem(
+        stage="navigation",
+        residual=innovations,
+        candidates=candidates,
+        group=np.tile(group, count),
+        series=component,
+        time=np.tile(time, count),
+        nuisance=np.zeros((component.size, 0)),
+        channel=component,
+        covariates=_covariates(solution, chosen, count, temperature),
+        unit="sigma",
+        group_names=names,
+    )
+
+
+def _groups(time: Array) -> tuple[NDArray[np.int64], dict[int, str]]:
+    """Equal stretches (k,) of the flight, and their names."""
+    span = float(time[-1] - time[0])
+    count = max(round(span / np.clip(span / GROUPS, SHORTEST, MINUTE)), 1)
+    edges = time[0] + span / count * np.arange(count + 1)
+    group = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, count - 1)
+    return group, {i: f"{edges[i]:.0f} to {edges[i + 1]:.0f} s" for i in range(count)}
+
+
+def _widely_estimated(
+    imu: Imu,
+    gnss: Gnss,
+    model: ImuModel,
+    mounting: Mounting,
+    settings: NavigationSettings,
+    initial: tuple[float, Array, Array] | None,
+    correction: ThermalCorrection | None,
+    effects: Mapping[str, Mapping[str, float]],
+) -> Solution:
+    """Smoothed, with every candidate a state of a wide prior."""
+    g_sensitivity = 3.0 * max(settings.g_sensitivity_sigma_deg_per_h_per_g, model.gyro.bias_sigma / DEG_PER_H)
+    wide = settings.model_copy(
+        update={
+            "estimate": tuple(dict.fromkeys((*settings.estimate, *CANDIDATES))),
+            "lever_arm_sigma_m": max(settings.lever_arm_sigma_m, WIDE_ARM),
+            "gnss_latency_sigma_s": max(settings.gnss_latency_sigma_s, WIDE_LATENCY),
+            "g_sensitivity_sigma_deg_per_h_per_g": g_sensitivity,
+        }
+    )
+    gyro, accel = (replace(s, scale_factor_sigma=WIDER * s.scale_factor_sigma) for s in (model.gyro, model.accel))
+    return smooth(imu, gnss, replace(model, gyro=gyro, accel=accel), mounting, wide, initial, correction, effects)[0]
+
+
+def _refused(solution: Solution) -> NDArray[np.bool_]:
+    """Fixes (n,) that are withheld, or of which the solution refused position or velocity."""
+    gnss, place = solution.problem.gnss, solution.gathered.of_fix
+    doubtful = (solution.store.verdict[place] == kalman.REJECTED).any(axis=1) | solution.store.reentry[place]
+    return np.asarray(doubtful | withheld(gnss.time, solution.problem.settings))
+
+
+def _chosen(solution: Solution, refused: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The fixes whose innovations are judged: used, MARGIN inside the inertial data, each stamp once."""
+    time, place = solution.problem.gnss.time, solution.gathered.of_fix
+    begun, ended = solution.problem.imu.time[[0, -1]]
+    inside = (time > begun + MARGIN) & (time < ended - MARGIN)
+    chosen = np.flatnonzero(inside & ~refused & solution.gathered.measurements.use[place])
+    return chosen[np.diff(time[chosen], prepend=-np.inf) > 0.0]
+
+
+def _candidates(model: ImuModel, settings: NavigationSettings) -> tuple[Candidate, ...]:
+    """With what the settings and the declared sigmas hold possible as sizes worth naming."""
+    worst_g = max(settings.g_sensitivity_sigma_deg_per_h_per_g * DEG_PER_H, model.gyro.bias_sigma) / STANDARD_GRAVITY
+    plausible = {
+        "antenna_lever_arm": settings.lever_arm_sigma_m,
+        "gnss_latency": settings.gnss_latency_sigma_s,
+        "gyro_scale_factor": SIGMAS * model.gyro.scale_factor_sigma,
+        "accel_scale_factor": SIGMAS * model.accel.scale_factor_sigma,
+        "gyro_g_sensitivity": worst_g,
+    }
+    out = []
+    for name in CANDIDATES:
+        effect = EFFECTS[name]
+        parameters = {
+            key: Parameter(effect.units[key], effect.largest[key], plausible=min(plausible[name], effect.largest[key]))
+            for key in effect.units
+        }
+        out.append(Candidate(name, parameters))
+    return tuple(out)
+
+
+def _temperature(imu: Imu) -> tuple[Array, Array] | None:
+    """Times and mean of the unit's thermometers, where it has any."""
+    t = imu.temperatures
+    if t is None:
+        return None
+    read = [v.reshape(len(t.time), -1) for v in (t.gyro, t.accel) if v is not None]
+    return (t.time, np.nanmean(np.hstack(read), axis=1)) if read else None
+
+
+def _covariates(
+    solution: Solution, chosen: NDArray[np.int64], count: int, temperature: tuple[Array, Array] | None
+) -> dict[str, Array]:
+    """Of the vehicle at each fix; velocity and acceleration are each component's own."""
+    store, gnss = solution.store, solution.problem.gnss
+    fixes = solution.gathered.of_fix[chosen]
+    time = gnss.time[chosen]
+    k = np.searchsorted(solution.problem.imu.time, time).clip(0, store.epoch.size - 1)
+    dcm, velocity = quaternion_to_dcm(store.q[k]), store.velocity[k]
+    roll, pitch, yaw = dcm_to_rpy(dcm)
+    rate, force = solution.gathered.measurements.rate[fixes], solution.gathered.measurements.force[fixes]
+    turning = np.einsum("kij,kj->ki", dcm, rate)
+    acceleration = np.einsum("kij,kj->ki", dcm, force) + [0.0, 0.0, STANDARD_GRAVITY]
+    common = {
+        "time": time,
+        "speed": np.hypot(velocity[:, 0], velocity[:, 1]),
+        "heading north": np.cos(yaw),
+        "heading east": np.sin(yaw),
+        "roll": roll,
+        "pitch": pitch,
+        "turn rate": turning[:, 2],
+        "specific force": np.linalg.norm(force, axis=1),
+        "height": gnss.height[chosen],
+        "sigma of position": np.linalg.norm(gnss.sigma_position[chosen], axis=1),
+    }
+    if temperature is not None:
+        common["temperature"] = np.interp(time, *temperature)
+    out = {name: np.tile(values, count) for name, values in common.items()}
+    out["velocity"] = np.tile(velocity.T, (count // 3, 1)).ravel()
+    out["acceleration"] = np.tile(acceleration.T, (count // 3, 1)).ravel()
+    return {name: values for name, values in out.items() if np.ptp(values) > 0.0}
