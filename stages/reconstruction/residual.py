@@ -1,0 +1,345 @@
+"""What the closed loop is offered of the flight's spectra: panels' pixels minus the interferogram of their reference.
+
+    r = [s(a) − level − Re ∫ R(σ)·B_ref(σ)·exp(i(2πσ·OPD(row, col) + φ(σ))) dσ]/sigma
+
+s is the mean over the pixels inside a panel (`panel_pixels`) in one detector column, each after dark, made linear and divided
+by its flat; level a polynomial in the column, one for each interferogram; φ one polynomial in σ for the whole campaign. Level
+and φ are estimated anew at every set of parameters, so that what is linearised about is always near.
+
+A scale that panels have one by one (dirt, a panel lit askew) is none of the candidates: it makes `response_scale` change from
+group to group, which the loop reports as structure without a name. One that all references share is `response_scale` itself.
+
+Functions
+---------
+residual_problem    of all lines of a campaign
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import InputError
+from pipeline.records import Calibration, Frames, References, Targets, Tracks
+from pipeline.residual_problem import Candidate, Parameter, Parameters, ResidualProblem
+from pipeline.usable_pixels import unusable
+from stages.reconstruction.forward import Forward
+from stages.reconstruction.panel_pixels import REACHES, PanelPixels, panel_pixels, pixel_noise, reaches
+from stages.reconstruction.spectra import ReconstructionSettings
+from tsmftis import detector
+from tsmftis.camera import Camera
+from tsmftis.effects import EFFECTS
+from tsmftis.interferometer import Interferometer, response_with_effects
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+LEVEL_ORDER = 2  # at least
+FEWEST_COLUMNS = 48  # of an interferogram that says something
+SPARE = 0.06  # of the range of path differences that the table holds on either side
+TURNS = 3  # of Gauss–Newton on φ
+PLAUSIBLE = {
+    "opd_scale": 1e-3,
+    "opd_quadratic": 1e-12,
+    "fringe_tilt": 1e-9,
+    "detector_nonlinearity": 0.02,
+    "channel_fringe": 0.02,
+    "response_scale": 0.02,
+}
+
+
+@dataclass(frozen=True)
+class SpectralLine:
+    """A flight line with the tracks of its targets (`tracking` is read of several methods)."""
+
+    frames: Frames
+    tracks: Tracks
+    targets: Targets
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class PanelSamples:
+    """Interferograms of panels, sample by sample, ordered by interferogram and column.
+
+    Pixels (m,): signal after dark, flat, line's frame time; `start` (n,): the first pixel of each sample. Samples (n,): mean row
+    and its variance, column, mean time. `interferogram` (n,) numbers them, `spectrum` (n,) the row of Forward.radiance.
+    """
+
+    signal: Array
+    flat: Array
+    start: Index
+    row: Array
+    row_variance: Array
+    col: Array
+    time: Array
+    interferogram: Index
+    spectrum: Index
+    names: tuple[str, ...]
+
+    @property
+    def count(self) -> Array:
+        return np.diff(np.append(self.start, self.signal.size)).astype(float)
+
+    def mean(self, of_pixels: Array) -> Array:
+        return np.asarray(np.add.reduceat(of_pixels, self.start) / self.count)
+
+
+def residual_problem(
+    lines: Sequence[SpectralLine],
+    calibration: Calibration,
+    references: References | None,
+    camera: Camera,
+    interferometer: Interferometer,
+    settings: ReconstructionSettings | None = None,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
+) -> ResidualProblem:
+    """r (n,) over all panels with a reference; `effects` of the stage spectral belong to the null and are no candidates.
+
+    InputError where no panel with a reference is seen.
+    """
+    settings = settings or ReconstructionSettings()
+    known = {name: values for name, values in (effects or {}).items() if EFFECTS[name].stage == "spectral"}
+    interferometer, calibration = interferometer.with_effects(known), calibration.with_effects(known)
+    samples, radiance, noise = _collect(lines, calibration, references, camera, settings)
+    return problem_of(samples, radiance, noise, calibration, interferometer, settings, tuple(known))
+
+
+def problem_of(
+    samples: PanelSamples,
+    radiance: Array,
+    noise: tuple[float, float],
+    calibration: Calibration,
+    interferometer: Interferometer,
+    settings: ReconstructionSettings,
+    known: Sequence[str] = (),
+) -> ResidualProblem:
+    """The problem of samples that are there; radiance (b, k) on the calibration's wavenumbers; noise: read² and gain [DN]."""
+    model = Model.of(samples, radiance, noise, calibration, interferometer, settings)
+    labels = samples.interferogram
+    return ResidualProblem(
+        stage="spectral",
+        residual=model.residual,
+        candidates=tuple(c for c in _candidates(model) if c.effect not in known),
+        group=labels,
+        series=labels,
+        time=samples.col,
+        nuisance=np.column_stack([model.levels, model.phase_columns()]),
+        covariates=model.covariates(),
+        sigma=1.0,
+        unit="sigma",
+        group_names=dict(enumerate(samples.names)),
+    )
+
+
+@dataclass(frozen=True)
+class Model:
+    """The forward model of samples, their levels as columns (n, p) with an orthonormal basis of their span, sigma (n,)."""
+
+    samples: PanelSamples
+    forward: Forward
+    calibration: Calibration
+    interferometer: Interferometer
+    sigma: Array
+    levels: Array
+    basis: Array
+    phase: Array = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(
+        cls,
+        samples: PanelSamples,
+        radiance: Array,
+        noise: tuple[float, float],
+        calibration: Calibration,
+        interferometer: Interferometer,
+        settings: ReconstructionSettings,
+    ) -> Model:
+        opd = interferometer.opd(samples.row, samples.col)
+        spare = SPARE * float(np.ptp(opd))
+        forward = Forward(calibration.wavenumber, radiance, opd.min() - spare, opd.max() + spare, settings.phase_order)
+        variance = (noise[0] + noise[1] * np.maximum(samples.signal, 0.0)) / samples.flat**2
+        sigma = np.sqrt(samples.mean(variance) / samples.count)
+        u = 2.0 * samples.col / (interferometer.cols - 1) - 1.0
+        order = max(settings.drift_order, LEVEL_ORDER)
+        own = samples.interferogram[:, None] == np.arange(len(samples.names))
+        levels = np.column_stack([own * (u**k / sigma)[:, None] for k in range(order + 1)])
+        basis, _ = np.linalg.qr(levels)
+        start = cls(samples, forward, calibration, interferometer, sigma, levels, basis)
+        return replace(start, phase=start.fitted_phase(start.first_phase(), {}, 12))
+
+    def cleared(self, columns: Array) -> Array:
+        """Columns (n, …) without what the levels take up."""
+        return columns - self.basis @ (self.basis.T @ columns)
+
+    def data(self, parameters: Parameters) -> Array:
+        """Linear signal (n,) over sigma."""
+        s = self.samples
+        a = self.interferometer.with_effects(parameters).detector_nonlinearity
+        return s.mean(detector.undo_nonlinearity(s.signal, a) / s.flat) / self.sigma
+
+    def fringes(self, parameters: Parameters, phase: Array, derivatives: bool) -> Array:
+        """Fringes over sigma, and their derivatives by the phase's coefficients (n, 1 or order + 2)."""
+        instrument = self.interferometer.with_effects(parameters)
+        response = response_with_effects(self.calibration.wavenumber, self.calibration.response, parameters)
+        opd = instrument.opd(self.samples.row, self.samples.col)
+        forward = self.forward
+        if opd.min() < forward.low or opd.max() > forward.high:
+            forward = replace(forward, low=min(forward.low, opd.min()), high=max(forward.high, opd.max()))
+        out = []
+        each, spectrum = np.arange(opd.size), self.samples.spectrum
+        for table in forward.tables(response, phase, derivatives):
+            out.append(table(opd)[each, spectrum])
+        middle = 2.0 * np.pi * float(forward.wavenumber.mean()) * instrument.fringe_tilt
+        blurred = np.exp(-0.5 * middle**2 * self.samples.row_variance)
+        return np.stack(out, -1) * (blurred / self.sigma)[:, None]
+
+    def first_phase(self) -> Array:
+        """Where to begin: the constant phase that fits best, of sixteen."""
+        zero = np.zeros(self.forward.order + 1)
+        y = self.cleared(self.data({}))
+        columns = self.fringes({}, zero, True)[:, :2]  # cos φ₀·I + sin φ₀·∂I/∂c₀
+        share = np.linalg.lstsq(self.cleared(columns), y, rcond=None)[0]
+        zero[0] = np.arctan2(share[1], share[0])
+        return zero
+
+    def fitted_phase(self, phase: Array, parameters: Parameters, turns: int) -> Array:
+        y = self.data(parameters)
+        for _ in range(turns):
+            columns = self.fringes(parameters, phase, True)
+            left = self.cleared(np.column_stack([y - columns[:, 0], columns[:, 1:]]))
+            phase = phase + np.linalg.lstsq(left[:, 1:], left[:, 0], rcond=None)[0]
+        return phase
+
+    def residual(self, parameters: Parameters) -> Array:
+        """r (n,) with levels and phase fitted."""
+        phase = self.fitted_phase(self.phase, parameters, TURNS)
+        return self.cleared(self.data(parameters) - self.fringes(parameters, phase, False)[:, 0])
+
+    def phase_columns(self) -> Array:
+        """∂r/∂c (n, order + 1) at the null."""
+        return self.fringes({}, self.phase, True)[:, 1:]
+
+    def covariates(self) -> dict[str, Array]:
+        s = self.samples
+        return {
+            "opd": self.interferometer.opd(s.row, s.col),
+            "column": s.col,
+            "row": s.row,
+            "signal level": (self.data({}) - self.residual({}))
+            * self.sigma,  # as modelled: noise must not sort samples
+            "time": s.time,
+        }
+
+
+def _candidates(model: Model) -> list[Candidate]:
+    out = []
+    for name, plausible in PLAUSIBLE.items():
+        effect = EFFECTS[name]
+        parameters = {
+            key: Parameter(unit, effect.largest[key], effect.least.get(key), plausible)
+            for key, unit in effect.units.items()
+        }
+        grid: tuple[Mapping[str, float], ...] = ()
+        if name == "channel_fringe":
+            parameters |= {
+                "thickness": Parameter("m", effect.largest["thickness"], 0.0, 1e-6, 1e-9),
+                "phase": Parameter("rad", effect.largest["phase"], None, 1.0, 1e-3),
+            }
+            grid = tuple({"amplitude": plausible, "thickness": float(t)} for t in thicknesses(model))
+        out.append(Candidate(name, parameters, grid))
+    return out
+
+
+def thicknesses(model: Model) -> Array:
+    """Optical thicknesses whose ghost of the centre burst falls among the samples, half a coherence length apart."""
+    forward, response = model.forward, model.calibration.response
+    power = (forward.radiance * response).mean(axis=0) ** 2
+    mean = np.average(forward.wavenumber, weights=power)
+    width = np.sqrt(np.average((forward.wavenumber - mean) ** 2, weights=power))
+    opd = model.interferometer.opd(model.samples.row, model.samples.col)
+    step = 1.0 / (2.0 * np.pi * width)
+    return np.arange(2.0 * step, float(np.abs(opd).max()), step)
+
+
+def _collect(
+    lines: Sequence[SpectralLine],
+    calibration: Calibration,
+    references: References | None,
+    camera: Camera,
+    settings: ReconstructionSettings,
+) -> tuple[PanelSamples, Array, tuple[float, float]]:
+    if references is None:
+        raise InputError(
+            "references", "file", "is missing", "spectra can be held against nothing: name one in campaign.yaml"
+        )
+    radiance = np.stack([np.interp(calibration.wavenumber, references.wavenumber, b) for b in references.radiance])
+    every = []
+    for line in lines:
+        tracks = line.tracks
+        leading = tracks.only("tracking" if "tracking" in tracks.methods else tracks.methods[-1])
+        usable = calibration.without(unusable(calibration, line.frames))
+        every.append(panel_pixels(line.frames, leading, usable, camera, settings.block_frames))
+    noise = pixel_noise(_joined([p.part(p.distance <= REACHES[0]) for p in every]))
+    parts: list[tuple[PanelPixels, Array, list[str], list[int]]] = []
+    for line, pixels in zip(lines, every, strict=True):
+        reach = reaches(pixels, noise, len(line.targets.ids))
+        spectra = [references.names.index(r) if r in references.names else -1 for r in line.targets.reference]
+        names = [f"{line.name} {t}".strip() for t in line.targets.ids]
+        inside = pixels.part(pixels.distance <= reach[pixels.target])
+        parts.append((inside, line.frames.time, names, spectra))
+    return (*_samples(parts, radiance, camera.cols), noise)
+
+
+def _joined(parts: Sequence[PanelPixels]) -> PanelPixels:
+    """All lines' pixels, the targets numbered on."""
+    shift = np.cumsum([0, *(int(p.target.max(initial=-1)) + 1 for p in parts)])
+    every = {f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(PanelPixels)}
+    numbered = np.concatenate([p.target + s for p, s in zip(parts, shift, strict=False)])
+    return PanelPixels(**{**every, "target": numbered})
+
+
+def _samples(
+    parts: Sequence[tuple[PanelPixels, Array, list[str], list[int]]], radiance: Array, cols: int
+) -> tuple[PanelSamples, Array]:
+    """The samples of targets with a reference and enough columns, and the spectra that occur (b, k)."""
+    chunks: dict[str, list[Array]] = {
+        n: [] for n in ("signal", "flat", "row", "row_variance", "col", "time", "interferogram", "spectrum", "count")
+    }
+    names: list[str] = []
+    for pixels, time, labels, spectra in parts:
+        for t, label in enumerate(labels):
+            mine = np.flatnonzero(pixels.target == t)
+            seen, start, count = np.unique(pixels.col[mine], return_index=True, return_counts=True)
+            if spectra[t] < 0 or seen.size < FEWEST_COLUMNS:
+                continue
+            row = pixels.row[mine].astype(float)
+            mean = np.add.reduceat(row, start) / count
+            for key, value in (
+                ("signal", pixels.signal[mine]),
+                ("flat", pixels.flat[mine]),
+                ("row", mean),
+                ("row_variance", np.add.reduceat(row**2, start) / count - mean**2),
+                ("col", seen.astype(float)),
+                ("time", np.add.reduceat(time[pixels.frame[mine]], start) / count),
+                ("interferogram", np.full(seen.size, len(names))),
+                ("spectrum", np.full(seen.size, spectra[t])),
+                ("count", count),
+            ):
+                chunks[key].append(value)
+            names.append(label)
+    if not names:
+        raise InputError(
+            "targets",
+            "column reference",
+            f"no target with a reference is seen whole on {FEWEST_COLUMNS} columns",
+            "the panels must be over three pixels wide, cross the detector, and have spectra in references.nc",
+        )
+    joined = {n: np.concatenate(values) for n, values in chunks.items()}
+    count = joined.pop("count")
+    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    used, spectrum = np.unique(joined.pop("spectrum"), return_inverse=True)
+    return PanelSamples(start=start, spectrum=spectrum, names=tuple(names), **joined), radiance[used]
