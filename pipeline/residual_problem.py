@@ -77,7 +77,7 @@ class ResidualProblem:
     nuisance    (n, p) columns N of what the stage's own model takes up; those that are zero outside one group are that group's
                 own, and are fitted there when it is held out
     channel     (n,) samples of one channel share their noise's variances (default: all of them)
-    covariates  name → (n,): what the remainder may depend on if no candidate accounts for it
+    covariates  name → (n,): what the remainder may depend on if no candidate accounts for it; NaN: not this sample
     sigma       the white noise's standard deviation where it is known (1 for whitened innovations): more than it is structure
     floor       RMS of the residual that is the method's own accuracy: below it nothing is looked for
     unit        of the residual, for a reader

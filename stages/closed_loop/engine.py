@@ -301,7 +301,7 @@ def _varies_with(
     stands for something else. A little less is an effect that is not exactly of the declared form."""
     rows = layout.rows
     labels = np.unique(problem.group[rows])
-    trials = {name: (term * (c - c[rows].mean()))[rows, None] for name, c in problem.covariates.items()}
+    trials = {name: (term * _centred(c, rows))[rows, None] for name, c in problem.covariates.items()}
     trials["group"] = np.column_stack([term[rows] * (problem.group[rows] == one) for one in labels[1:]])
     h = helped.shape[1]
     m = gram(layout, noise, np.column_stack([helped, *trials.values(), data[rows]]))
@@ -314,6 +314,13 @@ def _varies_with(
         if chance < lowest and value > CHANGES * size:
             worst, lowest = name, chance
     return worst
+
+
+def _centred(covariate: Array, rows: Index) -> Array:
+    """About its mean over `rows`; zero where it is not known."""
+    used = covariate[rows]
+    used = used[np.isfinite(used)]
+    return np.where(np.isfinite(covariate), covariate - (used.mean() if used.size else 0.0), 0.0)
 
 
 def _better_covariate(
