@@ -1,7 +1,7 @@
 """The engine on one part of a campaign, as a cached step: result as JSON, the residual's pictures as NetCDF.
 
-Beside the answer it keeps, for effects that were added, the parameters as they are without each of two halves of the groups
-(`halves`): figures on held-out data are made with those.
+Beside the answer it keeps, for effects that were added, their parameters without some groups (`folds_of`): figures on held-out
+data are made with those.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from flows.loop.problems import Part, inputs_of, problem_of, settings_of
+from flows.loop.problems import Part, inputs_of, picked_px, problem_of, settings_of
 from flows.steps import Paths, Plan, plain
 from pipeline.datasets import write_dataset
 from pipeline.residual_problem import ResidualProblem
@@ -33,7 +33,9 @@ def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
         with threadpool_limits(limits=1):
             problem = problem_of(plan, part)
             result = closed_loop.run(problem, plan.settings.closed_loop, seed)
-            content = content_of(part, problem, result)
+            content = content_of(part, problem, result, folds_of(plan, part, problem))
+            if part.stage == "geometry":
+                content["picked_px"] = picked_px(plan, result.values)
         write_json(to["result"], content)
         write_dataset(pictures_of(problem, result), to["pictures"])
         return content
@@ -55,8 +57,8 @@ def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
     )
 
 
-def content_of(part: Part, problem: ResidualProblem, result: LoopResult) -> dict[str, Any]:
-    """What loop.json and the page say of a part, in plain data."""
+def content_of(part: Part, problem: ResidualProblem, result: LoopResult, folds: list[list[int]]) -> dict[str, Any]:
+    """What loop.json and the page say of a part, in plain data; `folds`: labels of groups that figures are held out on."""
     content = result.to_dict()
     return {
         "stage": part.stage,
@@ -71,7 +73,7 @@ def content_of(part: Part, problem: ResidualProblem, result: LoopResult) -> dict
         "samples": int(problem.group.size),
         "groups": [problem.group_names.get(int(g), str(g)) for g in np.unique(problem.group)],
         "effects": plain(nested(result.values)),
-        "without": _refits(problem, result),
+        "without": _refits(problem, result, folds),
     }
 
 
@@ -93,20 +95,24 @@ def gathered(effect: str, parameters: Mapping[str, Mapping[str, Any]]) -> dict[s
     return out
 
 
-def halves(problem: ResidualProblem) -> list[list[int]]:
-    """Two halves of the groups' labels, taken in turn."""
+def folds_of(plan: Plan, part: Part, problem: ResidualProblem) -> list[list[int]]:
+    """Labels of the groups that figures are held out on together: the verification runs of a chamber; else two halves, the groups
+    taken in turn. No fold is all there is."""
     labels = [int(g) for g in np.unique(problem.group)]
-    return [labels[0::2], labels[1::2]]
+    folds = [labels[0::2], labels[1::2]]
+    if part.stage == "thermal":
+        assert plan.opened.keys.thermal is not None
+        verify = tuple(f"{run}," for run in plan.opened.keys.thermal.verify)
+        folds = [[g for g in labels if problem.group_names.get(g, "").startswith(verify)]] if verify else []
+    return [fold for fold in folds if 0 < len(fold) < len(labels)]
 
 
-def _refits(problem: ResidualProblem, result: LoopResult) -> list[dict[str, Any]]:
-    """For each half its groups' names, and the effects as all other groups have them; empty where nothing was added."""
-    if not result.values or np.unique(problem.group).size < 2:
-        return []
+def _refits(problem: ResidualProblem, result: LoopResult, folds: list[list[int]]) -> list[dict[str, Any]]:
+    """For each fold its groups' names, and the effects as all other groups have them; empty where nothing was added."""
     out = []
-    for half in halves(problem):
-        values, _ = closed_loop.refit(problem, {k: dict(v) for k, v in result.values.items()}, half)
-        names = [problem.group_names.get(g, str(g)) for g in half]
+    for fold in folds if result.values else []:
+        values, _ = closed_loop.refit(problem, {k: dict(v) for k, v in result.values.items()}, fold)
+        names = [problem.group_names.get(g, str(g)) for g in fold]
         out.append({"groups": names, "effects": plain(nested(values))})
     return out
 

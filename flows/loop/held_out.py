@@ -31,9 +31,8 @@ def held_out_step(
 ) -> StageRecord:
     """`root`/loop/held-out.json: {"before", "after", "how"}. `after`: the plan of the last run; `runs`: both runs' run.json."""
     first, second = (_of_run(run, after) for run in runs)
-    for name, answer in answers.items():
-        if name == "geometry" and (rms := answer["figures"].get("picked_px")):
-            first["geometry_residual_px"], second["geometry_residual_px"] = rms["before"], rms["after"]
+    if rms := answers.get("geometry", {}).get("picked_px"):
+        first["geometry_residual_px"], second["geometry_residual_px"] = rms["before"], rms["after"]
     bench = {str(a["bench"]): a["heldout_rms"] for a in answers.values() if a["bench"]}
     for figures, when in ((first, "before"), (second, "after")) if bench else ():
         each = {name: rms[when] for name, rms in bench.items()}
@@ -53,7 +52,7 @@ def held_out_step(
         with threadpool_limits(limits=1):
             if "thermal" in again:
                 second.update(_thermal(after, again["thermal"][0]["effects"]))
-                how["thermal"] = f"effects without {', '.join(again['thermal'][0]['groups'])}"
+                how["thermal"] = "verification runs, with effects from the training runs alone"
             if "spectral" in again:
                 figures, how["spectral"] = _spectral(after, again["spectral"])
                 second.update(figures)

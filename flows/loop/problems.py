@@ -8,20 +8,23 @@ Functions
 parts_of      the parts that a campaign has data for, and why others are missing
 inputs_of     files that a part is made of
 problem_of    its residual problem
+picked_px     control points before and after
 settings_of   the settings that it hangs on
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from flows.steps import Plan, compensation, initial_attitude, naming, of_camera, plain, turn_on
+from pipeline.errors import StageError
 from pipeline.raster import Dem
 from pipeline.records import Tracks, Trajectory
-from pipeline.residual_problem import ResidualProblem, joined
+from pipeline.residual_problem import Parameters, ResidualProblem, joined
 from stages import bench, navigation, reconstruction, registration, thermal, tracking
 
 
@@ -177,26 +180,43 @@ def _navigation(plan: Plan) -> ResidualProblem:
     return joined(problems)
 
 
-def _geometry(plan: Plan) -> ResidualProblem:
+def geometry_of(plan: Plan) -> dict[str, Any]:
+    """What `tracking.residual_problem` and `tracking.geometry_residual_px` are made of."""
     campaign = plan.opened
     camera, mounting = campaign.instrument.camera, campaign.instrument.mounting
     assert camera is not None and mounting is not None
-    dem = None if campaign.keys.dem is None else Dem.from_file(campaign.path(campaign.keys.dem))
     lines = []
     for flight, line in lines_of(plan):
         frames = campaign.frames(flight, line)
         lines.append(
-            tracking.GeometryLine(
+            tracking.Line(
                 f"{flight}/{line}",
                 Trajectory.from_file(plan.out / flight / "trajectory.nc"),
                 frames.time,
-                campaign.targets(flight, line),
                 campaign.gcps(flight, line),
+                campaign.targets(flight, line),
                 registration.image_motion(frames, camera, plan.settings.registration, of_camera(plan)),
                 campaign.imu(flight).temperatures,
+                flight,
             )
         )
-    return tracking.residual_problem(lines, dem, camera, mounting, plan.settings.tracking, plan.effects("geometry"))
+    dem = None if campaign.keys.dem is None else Dem.from_file(campaign.path(campaign.keys.dem))
+    return {"lines": lines, "camera": camera, "mounting": mounting, "dem": dem, "effects": plan.effects("geometry")}
+
+
+def _geometry(plan: Plan) -> ResidualProblem:
+    made = tracking.residual_problem(**geometry_of(plan))
+    if made is None:
+        raise StageError(
+            "there are no control points, no texture to follow from frame to frame, and no heights to compare"
+        )
+    return made
+
+
+def picked_px(plan: Plan, found: Parameters) -> dict[str, float] | None:
+    """RMS of the control points [px] before, and after with each group predicted from the others; None without such points."""
+    before, after = tracking.geometry_residual_px(**geometry_of(plan), found=found)
+    return {"before": before, "after": after} if math.isfinite(before) else None
 
 
 def _spectral(plan: Plan) -> ResidualProblem:

@@ -63,9 +63,7 @@ def image_motion(
         if link is not None and (points := _inside(link, camera, settings)) is not None:
             found.append((int(first), second, *points))
     sizes = [len(f[2]) for f in found]
-    at, moved = (
-        np.concatenate([f[i] for f in found]) if found else np.zeros((0, 2)) for i in (2, 3)
-    )
+    at, moved = (np.concatenate([f[i] for f in found]) if found else np.zeros((0, 2)) for i in (2, 3))
     return ImageMotion(
         np.array([f[0] for f in found], int),
         np.array([f[1] for f in found], int),

@@ -67,7 +67,9 @@ class ResidualSettings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     motion_sigma_px: float = Field(0.02, gt=0, description="noise of a pair's motion, alike all over the image")
-    shape_sigma_px: float = Field(0.01, gt=0, description="the same of what is not alike: slopes and curves over the image")
+    shape_sigma_px: float = Field(
+        0.01, gt=0, description="the same of what is not alike: slopes and curves over the image"
+    )
     motion_bias_px: float = Field(0.005, ge=0, description="what registration is off by throughout a line")
     dem_datum_m: float = Field(0.05, ge=0, description="agreement of DEM and survey on what height is")
     least_sigma_position_m: float = Field(
@@ -169,9 +171,7 @@ class _Line:
     def _at(self, latency: float) -> tuple[Trajectory, Condition]:
         line = self.line
         time = line.stamps[self.frames] - latency
-        everything = Mounting(
-            np.zeros(3), drift=np.full(3, float(line.temperatures is not None)), flexure=np.ones(2)
-        )
+        everything = Mounting(np.zeros(3), drift=np.full(3, float(line.temperatures is not None)), flexure=np.ones(2))
         return poses_at(line.trajectory, time), Condition.at(time, line.trajectory, everything, line.temperatures)
 
     def poses(self, geometry: Geometry, error: Offsets | None = None) -> tuple[Array, Array]:
@@ -234,7 +234,9 @@ class _Line:
             q = np.linalg.qr(columns)[0]
             q *= np.sign(np.einsum("ij,ij->j", q, columns))
             pairs.append((slice(sum_, sum_ + labels.size), q.T * np.sqrt(size / size.sum())))
-            alike = np.where(np.arange(columns.shape[1]) == 0, self.settings.motion_sigma_px, self.settings.shape_sigma_px)
+            alike = np.where(
+                np.arange(columns.shape[1]) == 0, self.settings.motion_sigma_px, self.settings.shape_sigma_px
+            )
             sigmas.append(np.hypot(motion.sigma[p] / np.sqrt(size.sum()), alike))
             cells.append(np.vstack([np.full(labels.size, p), mean]))
             sum_ += labels.size
@@ -287,7 +289,9 @@ class _Line:
         normal = np.einsum("pij,pj->pi", axes, np.stack([-slope[0], -slope[1], -np.ones(latitude.size)], -1))
         return replace(modes, ground=ground, normal=normal, up=-axes[:, :, 2])
 
-    def _moved(self, modes: Modes, geometry: Geometry, centre: Array, dcm: Array, raised: float = 0.0) -> tuple[Array, Array]:
+    def _moved(
+        self, modes: Modes, geometry: Geometry, centre: Array, dcm: Array, raised: float = 0.0
+    ) -> tuple[Array, Array]:
         """Shift seen minus shift predicted (point,) of row and column, over ground that lies `raised` higher."""
         ray = np.einsum("pij,pj->pi", dcm[modes.first], geometry.camera.directions(modes.row, modes.col))
         start = centre[modes.first]
