@@ -102,10 +102,11 @@ def _process(plan: Plan, seed: int, console: Console) -> bool:
 def print_loop(console: Console, content: dict[str, Any]) -> None:
     """Verdict, what was added and why, what cannot be told, figures before and after."""
     console.print(f"\n{content['campaign']}: {SAID[content['verdict']]}", style="bold", markup=False)
+    from pipeline.report.loop import values
+
     for step in content["steps"]:
-        values = ", ".join(f"{name} {_value(v)}" for name, v in step["parameters"].items())
         of = f", bench {step['bench']}" if "bench" in step else ""
-        console.print(f"+ {step['effect']} ({step['stage']}{of}): {values}", markup=False)
+        console.print(f"+ {step['effect']} ({step['stage']}{of}): {values(step['parameters'])}", markup=False)
         console.print(f"    {step['evidence']}", markup=False)
         if step["indistinguishable_from"]:
             console.print(f"    cannot be told from: {', '.join(step['indistinguishable_from'])}", markup=False)
@@ -126,8 +127,3 @@ def print_loop(console: Console, content: dict[str, Any]) -> None:
 
 def _figure(value: float | list[float]) -> str:
     return ", ".join(f"{v:.4g}" for v in (value if isinstance(value, list) else [value]))
-
-
-def _value(entry: dict[str, Any]) -> str:
-    values, sigmas = ([v] if isinstance(v, float | int) else v for v in (entry["value"], entry["sigma"]))
-    return " ".join(f"{v:.4g} ± {s:.2g}" for v, s in zip(values, sigmas, strict=True)) + f" {entry['unit']}"

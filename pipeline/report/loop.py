@@ -20,14 +20,17 @@ from scipy.stats import norm
 from pipeline.datasets import open_dataset
 from pipeline.report.figures import layout, thin
 from pipeline.report.page import Numbered, significant
+from tsmftis.geodesy import STANDARD_GRAVITY
 
 Array = NDArray[np.float64]
 
-BEFORE, AFTER = "#8c8c8c", "#0b63b0"
-BINS = 12
+COLOURS = {"before": "#8c8c8c", "after": "#0b63b0"}
+BINS, EVIDENCE_BINS = 12, 16
 FEWEST_A_BIN = 8
+ONE_VALUE = 0.2  # share of the samples that one value of a covariate may have and still be a value of it
 MOST_COVARIATES = 9
 COLUMNS = 3
+ORDER = ("thermal", "navigation", "geometry", "spectral")
 FIGURES = (
     ("rqe_tracking_mean", "RQE of tracking, one point, mean over targets"),
     ("rqe_area_tracking_mean", "RQE of tracking, area mean, mean over targets"),
@@ -41,11 +44,13 @@ FIGURES = (
 
 def write_loop_page(content: dict[str, Any], out: Path) -> Path:
     """Write `out`/loop.html for the content of loop.json; returns its path."""
+    content = content | {"parts": {name: content["parts"][name] for name in sorted(content["parts"], key=_order)}}
     draw = Numbered()
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"figure": significant, "sigmas": sigmas, "values": values}
     template = environment.from_string(files("pipeline.report").joinpath("loop.html").read_text(encoding="utf-8"))
-    runs = [json.loads((out / path).read_text(encoding="utf-8")) for path in content["provenance"]["runs"].values()]
+    places = content["provenance"]["runs"]
+    runs = [json.loads((out / places[when]).read_text(encoding="utf-8")) for when in COLOURS]
     shown = {}
     for name in content["parts"]:
         with open_dataset(out / "loop" / f"{name}.nc") as d:
@@ -58,7 +63,7 @@ def write_loop_page(content: dict[str, Any], out: Path) -> Path:
         content=content,
         figures=[(label, content["before"][k], content["after"][k]) for k, label in FIGURES if k in content["before"]],
         shown=shown,
-        targets=draw.html(targets(*runs)) if runs[0].get("rqe") and len({*map(json.dumps, runs)}) > 1 else None,
+        targets=draw.html(targets(*runs)) if runs[0].get("rqe") and places["before"] != places["after"] else None,
         plotly=Markup(get_plotlyjs()),
         style=Markup(files("pipeline.report").joinpath("page.css").read_text(encoding="utf-8")),
     )
@@ -69,37 +74,63 @@ def write_loop_page(content: dict[str, Any], out: Path) -> Path:
     return path
 
 
+def _order(part: str) -> tuple[int, str]:
+    """Parts in the order of processing, laboratory interferograms last."""
+    return (ORDER.index(part) if part in ORDER else len(ORDER), part)
+
+
 def sigmas(p: float) -> str:
     """A p-value as the distance in sigma that a normal variate has with it, both sides."""
     return "> 37" if p < 1e-300 else f"{norm.isf(p / 2.0):.1f}"
 
 
+READABLE = {  # SI unit → the field's, its factor; a time is in ms where it is short
+    "rad s-1": ("°/h", np.rad2deg(3600.0)),
+    "m s-2": ("µg", 1e6 / STANDARD_GRAVITY),
+    "rad": ("°", np.rad2deg(1.0)),
+    "rad/K": ("°/K", np.rad2deg(1.0)),
+}
+SHORT_S = 0.1
+
+
 def values(parameters: dict[str, Any]) -> str:
-    """name value ± sigma unit, of every parameter."""
+    """name value ± sigma unit, of every parameter, in the field's units."""
     said = []
     for name, entry in parameters.items():
-        pairs = zip(*([v] if not isinstance(v, list) else v for v in (entry["value"], entry["sigma"])), strict=True)
-        unit = "" if entry["unit"] == "1" else f" {entry['unit']}"
-        said.append(f"{name} " + ", ".join(f"{v:.4g} ± {s:.2g}" for v, s in pairs) + unit)
+        pairs = [v if isinstance(v, list) else [v] for v in (entry["value"], entry["sigma"])]
+        unit, factor = READABLE.get(entry["unit"], (entry["unit"], 1.0))
+        if unit == "s" and abs(pairs[0][0]) < SHORT_S:
+            unit, factor = "ms", 1e3
+        told = ", ".join(f"{factor * v:.4g} ± {factor * s:.2g}" for v, s in zip(*pairs, strict=True))
+        said.append(f"{name.replace('_', ' ')} {told}" + ("" if unit == "1" else f" {unit}"))
     return "; ".join(said)
 
 
-def binned(x: Array, y: Array, bins: int = BINS) -> tuple[Array, Array, Array]:
-    """Mean x, mean y and the standard error of y in bins of equally many samples (k,); bins of too few are left out."""
-    order = np.argsort(x, kind="stable")
-    parts = [part for part in np.array_split(order, bins) if part.size >= FEWEST_A_BIN]
+def binned(x: Array, y: Array, edges: Array) -> tuple[Array, Array, Array]:
+    """Mean x, mean y and the standard error of y between edges (k + 1,) → (k,); bins of too few samples are left out."""
+    bins = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, edges.size - 2)
+    parts = [p for p in (np.flatnonzero(bins == b) for b in range(edges.size - 1)) if p.size >= FEWEST_A_BIN]
     spread = [y[part].std(ddof=1) / np.sqrt(part.size) for part in parts]
     return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts]), np.array(spread)
 
 
-def _points(figure: go.Figure, x: Array, y: Array, name: str, colour: str, first: bool, **where: int) -> None:
-    at, mean, error = binned(x, y)
+def applies(covariate: Array) -> NDArray[np.bool_]:
+    """Samples that a covariate is of: where it is one channel's, the others have no value or all the same."""
+    known = np.isfinite(covariate)
+    value, count = np.unique(covariate[known], return_counts=True)
+    if value.size > 2 and count.max() > ONE_VALUE * covariate.size:
+        known &= covariate != value[count.argmax()]
+    return known
+
+
+def _points(figure: go.Figure, x: Array, y: Array, edges: Array, name: str, first: bool, **where: int) -> None:
+    at, mean, error = binned(x, y, edges)
     figure.add_scatter(
         x=at.tolist(),
         y=mean.tolist(),
         error_y={"type": "data", "array": error.tolist(), "thickness": 1.2, "width": 2},
         mode="markers",
-        marker={"color": colour, "size": 6},
+        marker={"color": COLOURS[name], "size": 6},
         name=name,
         legendgroup=name,
         showlegend=first,
@@ -111,31 +142,49 @@ def evidence(d: xr.Dataset, term: str) -> go.Figure:
     """Residual before and after against what the effect contributes, both free of what the model takes up."""
     unit = d["before"].attrs["units"]
     x = d[term].values
-    figure = go.Figure()
     reach = [float(x.min()), float(x.max())]
+    edges = np.linspace(reach[0], reach[1], EVIDENCE_BINS + 1)
+    figure = go.Figure()
     figure.add_scatter(x=reach, y=reach, mode="lines", name="slope 1", line={"color": "#c0392b", "width": 1.2})
     figure.add_hline(y=0.0, line={"color": "#999", "width": 1})
-    _points(figure, x, d["before"].values, "before", BEFORE, True)
-    _points(figure, x, d["after"].values, "after", AFTER, True)
+    for name in COLOURS:
+        _points(figure, x, d[name].values, edges, name, True)
     figure.update_xaxes(title=f"contribution of {term[5:].replace('_', ' ')} [{unit}]")
     figure.update_yaxes(title=f"residual, mean of a bin [{unit}]")
     return layout(figure, 400)
 
 
 def covariates(d: xr.Dataset) -> go.Figure:
-    """Residual before and after, binned, against each covariate."""
-    names = [k for k in d if str(k).startswith("covariate_")][:MOST_COVARIATES]
-    rows = max(1, -(-len(names) // COLUMNS))
+    """Residual before and after, binned, against the nine covariates that it follows most; once where nothing was added."""
+    shown, same = [], bool((d["before"] == d["after"]).all())
+    for k in (k for k in map(str, d) if k.startswith("covariate_")):
+        mine = applies(d[k].values)
+        x = d[k].values[mine]
+        bins = min(BINS, max(3, x.size // (2 * FEWEST_A_BIN)))
+        edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, bins + 1))) if x.size else x
+        if edges.size < 3:
+            continue
+        _, mean, error = binned(x, d["before"].values[mine], edges)
+        strength = float(np.mean((mean / np.maximum(error, 1e-300)) ** 2)) if mean.size else 0.0
+        shown.append((strength, k, mine, edges))
+    shown = sorted(shown, key=lambda one: -one[0])[:MOST_COVARIATES]
+    rows = max(1, -(-len(shown) // COLUMNS))
     figure = make_subplots(
-        rows=rows, cols=COLUMNS, subplot_titles=[d[k].attrs["long_name"] for k in names], vertical_spacing=0.16 / rows
+        rows=rows,
+        cols=COLUMNS,
+        subplot_titles=[d[k].attrs["long_name"] for _, k, _, _ in shown],
+        vertical_spacing=0.3 / rows,
+        horizontal_spacing=0.07,
     )
-    for i, k in enumerate(names):
+    for i, (_, k, mine, edges) in enumerate(shown):
         where = {"row": i // COLUMNS + 1, "col": i % COLUMNS + 1}
-        for name, colour in (("before", BEFORE), ("after", AFTER)):
-            _points(figure, d[k].values, d[name].values, name, colour, i == 0, **where)
-    unit = d["before"].attrs["units"]
-    figure.update_yaxes(title=f"[{unit}]", col=1)
-    return layout(figure, 90 + 200 * rows)
+        for name in COLOURS if not same else ("after",):
+            _points(figure, d[k].values[mine], d[name].values[mine], edges, name, i == 0 and not same, **where)
+    figure.update_yaxes(title=f"[{d['before'].attrs['units']}]", col=1)
+    figure.update_annotations(font_size=13)
+    layout(figure, 130 + 210 * rows)
+    figure.update_layout(margin={"t": 85}, legend={"y": 1.0 + 45.0 / (210.0 * rows)})
+    return figure
 
 
 def residual(d: xr.Dataset) -> go.Figure:
@@ -144,7 +193,7 @@ def residual(d: xr.Dataset) -> go.Figure:
     figure = make_subplots(rows=channels.size, cols=1, shared_xaxes=True, vertical_spacing=0.03)
     for i, channel in enumerate(channels, start=1):
         mine = np.flatnonzero(d["channel"].values == channel)
-        for name, colour in (("before", BEFORE), ("after", AFTER)):
+        for name, colour in COLOURS.items():
             at, y = thin(np.arange(mine.size, dtype=float), d[name].values[mine])
             figure.add_scattergl(
                 x=at,
@@ -170,7 +219,7 @@ def targets(first: dict[str, Any], second: dict[str, Any]) -> go.Figure:
         rows=1, cols=2, shared_yaxes=True, subplot_titles=("one point", "area mean"), horizontal_spacing=0.04
     )
     for col, kind in enumerate(("rqe", "rqe_area"), start=1):
-        for run, name, colour in ((first, "before", BEFORE), (second, "after", AFTER)):
+        for run, (name, colour) in zip((first, second), COLOURS.items(), strict=True):
             scores = {
                 f"{f}/{i} {t}": v
                 for f, flight in run["flights"].items()

@@ -128,7 +128,7 @@ def confirm(
 ) -> Confirmation:
     """`library`: what each member would make of the model (its columns are before's and its own); `families`: their effects;
     `refined`: the chosen one's, linearised where it converged."""
-    spread = channel_spread(problem, rows, before.data)
+    spread = channel_spread(problem, rows, refined, noise)
     totals = np.zeros(2)
     agree, same, gains = 0, True, []
     folds = [rows[f] for f in folds_of(problem.group[rows])]
@@ -171,16 +171,19 @@ def confirm(
     )
 
 
-def channel_spread(problem: ResidualProblem, rows: Index, data: Array) -> Array:
-    """RMS of the data (n,) of each sample's channel (n,), one where there is a single channel."""
+def channel_spread(problem: ResidualProblem, rows: Index, model: Model, noise: Noise) -> Array:
+    """RMS of what the model leaves of each sample's channel (n,), one where there is a single channel: a channel counts by its
+    noise, not by what an effect makes in it."""
+    out = np.ones(model.data.size)
     if problem.channel is None:
-        return np.ones(data.size)
-    out = np.ones(data.size)
+        return out
+    m = gram(Layout.of(problem, rows), noise, np.column_stack([model.columns, model.data])[rows])
+    left = model.data - model.columns @ coefficients(m, model.columns.shape[1], model)
     for label in np.unique(problem.channel):
         mine = problem.channel == label
         used = rows[mine[rows]]
         if used.size:
-            out[mine] = max(float(np.sqrt(np.mean(data[used] ** 2))), 1e-300)
+            out[mine] = max(float(np.sqrt(np.mean(left[used] ** 2))), 1e-300)
     return out
 
 

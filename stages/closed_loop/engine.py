@@ -192,7 +192,7 @@ def _named_step(
         member = found[finding.index]
         step = _examine(problem, layout, state, candidates, found, finding, settings, rng)
         if isinstance(step, Refusal):
-            state.notes.append(f"{member.effect} stands out (p = {finding.p:.2g}) but is not added: {step.why}")
+            state.notes.append(f"{member.effect} stands out (p {_p_text(finding.p)}) but is not added: {step.why}")
             state.refused[member.effect] = step.why
             if step.structure and finding.p < CERTAIN:
                 state.certain.append(member.effect)
@@ -252,7 +252,7 @@ def _examine(
     if not checked.passes(settings.gain, settings.decisive):
         return Refusal(_why_not(checked), _repeats(checked))
     tests = f"largest of {len(found)} tests, {_noise_text(problem, finding.noise)}"
-    evidence = f"p = {finding.p:.2g} ({tests}); {_held_out_text(problem, checked)}; {_controls_text(reached, valid)}"
+    evidence = f"p {_p_text(finding.p)} ({tests}); {_held_out_text(problem, checked)}; {_controls_text(reached, valid)}"
     if rivals:
         beside = ", ".join(f"{name} ({snr:.1f} sigma left)" for name, snr in rivals.items())
         evidence += f"; cannot be told from {beside}"
@@ -445,7 +445,7 @@ def _learned_step(
                 problem.stage,
                 f"learned:{name}",
                 {"rms": Value(size, sigma, problem.unit)},
-                f"p = {finding.p:.2g} ({tests}); {_held_out_text(problem, checked)}; {share} of {valid} shifts within series",
+                f"p {_p_text(finding.p)} ({tests}); {_held_out_text(problem, checked)}; {share} of {valid} shifts within series",
                 (),
                 checked.before,
                 checked.after,
@@ -456,7 +456,7 @@ def _learned_step(
         state.nuisance = np.column_stack([state.nuisance, spline])
         state.noise = finding.noise
         return True
-    state.notes.append(f"{name} stands out among covariates (p = {finding.p:.2g}) but is not used: {problem_text}")
+    state.notes.append(f"{name} stands out among covariates (p {_p_text(finding.p)}) but is not used: {problem_text}")
     if finding.p < CERTAIN and _repeats(checked) and confirmation.controls_fail(reached, valid):
         state.certain.append(f"learned:{name}")
     return False
@@ -611,6 +611,10 @@ def _held_out_text(problem: ResidualProblem, c: Confirmation) -> str:
         f"held-out RMS {c.before:.4g} → {c.after:.4g} {problem.unit} ({-100.0 * c.gain:+.1f} %), log-likelihood"
         f" {c.log_likelihood:+.1f}, chosen in {c.chosen} of {c.folds} folds"
     )
+
+
+def _p_text(p: float) -> str:
+    return "< 1e-300" if p < 1e-300 else f"= {p:.2g}"
 
 
 def _controls_text(reached: int, valid: int) -> str:
