@@ -63,8 +63,10 @@ def thermal_ratios(campaign: Path, truth: Path, run: dict[str, Any]) -> dict[str
 
 
 def withheld(campaign: Path, truth: Path, run: Path) -> str:
-    """Misses of fixes that the campaign does not hold [m], at the antenna."""
+    """Misses of fixes that the campaign does not hold [m], at the antenna, where the run's model update has it."""
     lever = np.array(yaml.safe_load((campaign / "instrument.yaml").read_text())["mounting"]["imu_to_antenna_m"])
+    update = json.loads((run / "run.json").read_text())["provenance"]["model_update"].get("effects", {})
+    lever += [update.get("antenna_lever_arm", {}).get(axis, 0.0) for axis in "xyz"]
     fixes = np.load(truth / "withheld.npz")["gnss"]
     with xr.open_dataset(next(run.glob("*/trajectory.nc"))) as d:
         time = fixes[:, 0]

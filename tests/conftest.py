@@ -47,13 +47,14 @@ def tsmftis() -> Command:
     return command
 
 
-@pytest.fixture(scope="session")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The demo preset cut down: 68 s of flight with a turn, two lines of 2 s with two panels, 48 × 64 pixels."""
+def tiny(folder: Path, **effects: dict[str, float]) -> Path:
+    """The demo preset cut down: 68 s of flight with a turn, two lines of 2 s with two panels, 48 × 64 pixels; with undeclared
+    effects, if any are named. Written into `folder`, its truth beside it."""
     from stages import simulation
 
     preset = simulation.SimulationSettings.preset("demo").model_dump()
     preset["name"] = "tiny"
+    preset["effects"] = effects
     preset["instrument"]["imu"]["rate_hz"] = 100.0
     preset["instrument"]["camera"] |= {"rows": 48, "cols": 64, "principal_point_px": {"row": 23.8, "col": 31.1}}
     preset["instrument"]["interferometer"]["zpd_col"] = 12.0
@@ -72,9 +73,20 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
             {"hold_min": 5.0},
             {"to_degc": 0.0, "rate_k_per_min": 3.0},
         ]
-    folder = tmp_path_factory.mktemp("demo") / "tiny"
     simulation.write(simulation.run(simulation.SimulationSettings.model_validate(preset), 1), folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def simulated() -> Callable[..., Path]:
+    """`simulated(folder, camera_latency={"latency": …})`: a tiny campaign with undeclared effects."""
+    return tiny
+
+
+@pytest.fixture(scope="session")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny campaign without undeclared effects; tests must not change it."""
+    return tiny(tmp_path_factory.mktemp("demo") / "tiny")
 
 
 @pytest.fixture(scope="session")

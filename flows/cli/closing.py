@@ -68,6 +68,7 @@ def close_loop(
     belongs(plan, opened.keys.name, out, "loop.json")
     for warning in check_campaign(opened).warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False)
+    _refuse_nothing(plan)
     plan.out.mkdir(parents=True, exist_ok=True)
     with alone(plan, out):
         failed = _process(plan, seed, console)
@@ -76,6 +77,17 @@ def close_loop(
     )
     if failed:
         raise typer.Exit(1)
+
+
+def _refuse_nothing(plan: Plan) -> None:
+    from flows.loop.problems import parts_of
+
+    parts, missing = parts_of(plan)
+    if not parts:
+        why = "; ".join(f"{name}: {said}" for name, said in missing.items())
+        raise InputError(
+            plan.campaign / "campaign.yaml", "campaign", f"holds nothing to look at ({why})", "add what is missing"
+        )
 
 
 def _process(plan: Plan, seed: int, console: Console) -> bool:

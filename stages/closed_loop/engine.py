@@ -412,7 +412,7 @@ def _learned_step(
     finding, state.noise = search(
         layout, columns[rows], [splines[n][rows] for n in names], data[rows], state.noise, settings.draws, rng
     )
-    if finding is None or finding.p > settings.p_value:
+    if finding is None or finding.p > settings.learned_p_value:
         return False
     name = names[finding.index]
     spline = splines[name]

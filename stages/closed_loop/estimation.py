@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.residual_problem import Candidate, ResidualProblem
-from stages.closed_loop.noise import Layout, Noise, fit_noise, gram
+from stages.closed_loop.noise import Layout, Noise, deviance, fit_noise, gram, whitened
 from stages.closed_loop.score_test import project, solve
 from stages.closed_loop.signatures import Values, derivatives, merged
 
@@ -24,6 +24,7 @@ ITERATIONS = 25
 CONVERGED = 1e-3  # of a step, in sigma
 ROUNDS = 4  # of noise and effects in turn, ...
 SETTLED = 0.05  # ... until the effects move less than this, in sigma
+EARLY = 0.7
 AT_BOUND = 1e-6  # relative distance from a physical bound that counts as lying on it
 
 
@@ -54,8 +55,47 @@ def estimate(
 ) -> Estimate:
     """From `values` to the minimum over all their parameters; `nuisance` (n, p) over all samples, of which layout.rows count.
 
-    A parameter on its physical bound stays there and is named in `at_bound`.
+    A parameter on its physical bound stays there and is named in `at_bound`. Far from the minimum the misfit itself looks like
+    coloured noise, in which the descent can come to rest: where plain least squares would leave much less, it is begun again from
+    there, and the likelier of both is the answer.
     """
+    found = _descend(problem, layout, nuisance, values, candidates, noise)
+    if not _rests_early(layout, nuisance, found):
+        return found
+    plain = _descend(problem, layout, nuisance, found.values, candidates, whitened(noise), rounds=1)
+    other = _descend(problem, layout, nuisance, plain.values, candidates, plain.noise)
+    both = [
+        deviance(layout, e.noise, np.column_stack([nuisance, e.signatures])[layout.rows], e.residual[layout.rows])
+        for e in (found, other)
+    ]
+    return other if both[1] < both[0] else found
+
+
+def _rests_early(layout: Layout, nuisance: Array, found: Estimate) -> bool:
+    """Whether a step by least squares would leave less than EARLY of the RMS."""
+    rows = layout.rows
+    n, s, r = nuisance[rows], found.signatures[rows], found.residual[rows]
+
+    def left(columns: Array) -> float:
+        if not columns.shape[1]:
+            return float(np.linalg.norm(r))
+        size = np.linalg.norm(columns, axis=0)
+        columns = columns / np.where(size > 0.0, size, 1.0)
+        return float(np.linalg.norm(r - columns @ np.linalg.lstsq(columns, r, rcond=None)[0]))
+
+    return left(np.column_stack([n, s])) < EARLY * left(n)
+
+
+def _descend(
+    problem: ResidualProblem,
+    layout: Layout,
+    nuisance: Array,
+    values: Values,
+    candidates: Mapping[str, Candidate],
+    noise: Noise,
+    rounds: int = ROUNDS,
+) -> Estimate:
+    """Gauss–Newton in the given noise, then in the noise that it leaves, in turn."""
     order = tuple((effect, name) for effect in values for name in candidates[effect].parameters)
     rows, p = layout.rows, nuisance.shape[1]
     low = np.array([candidates[e].parameters[n].low for e, n in order])
@@ -73,7 +113,7 @@ def estimate(
         both = np.column_stack([nuisance, residual])[rows]
         return float(project(gram(layout, noise, both), slice(0, p))[-1, -1])
 
-    for again in range(ROUNDS):
+    for again in range(rounds):
         begun = at
         residual = problem.residual(packed(at))
         now = cost(residual)

@@ -13,6 +13,7 @@ Functions
 Layout         the samples in use, by channel
 fit_noise      the variances of each channel by REML, given X
 noise_draws    variances that the data would have allowed as well
+deviance       −2·l of residuals about columns
 gram           C'K⁻¹C
 
 References
@@ -24,7 +25,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -235,6 +236,24 @@ def _fit_channel(channel: Channel, x: Array, y: Array, start: Colour | None) -> 
     except (FloatingPointError, np.linalg.LinAlgError):  # all of y is in the columns
         return start or Colour(max(float(np.mean(target**2)), 1e-300), 1e-9, channel.median_step, 0.0)
     return Colour(variance, kappa, tau, dof)
+
+
+def deviance(layout: Layout, noise: Noise, x: Array, y: Array) -> float:
+    """−2·l summed over the channels, of y (rows,) about the columns x (rows, p): the smaller, the likelier."""
+    total = 0.0
+    for channel, colour in zip(layout.channels, noise, strict=True):
+        if channel.index.size:
+            part, target = _clear(channel, x, y)
+            try:
+                total += criterion(channel, colour.kappa, colour.tau, part, target)[0]
+            except (FloatingPointError, np.linalg.LinAlgError):
+                return float("inf")
+    return total
+
+
+def whitened(noise: Noise) -> Noise:
+    """The same variances without the process."""
+    return tuple(replace(colour, kappa=float(np.exp(LOG_KAPPA[0]))) for colour in noise)
 
 
 def noise_draws(layout: Layout, x: Array, y: Array, fitted: Noise, count: int, rng: np.random.Generator) -> list[Noise]:

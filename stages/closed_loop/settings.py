@@ -12,6 +12,8 @@ class LoopSettings(BaseModel):
 
     p_value: float = Field(0.05, gt=0, lt=1)
     """Of the largest statistic over the whole library, below which an effect is looked at."""
+    learned_p_value: float = Field(0.01, gt=0, lt=1)
+    """The same for a curve of a covariate, which has no name to be checked against."""
     gain: float = Field(0.10, gt=0, lt=1)
     """Share of the held-out RMS by which an effect must lower it, ..."""
     decisive: float = Field(3.0, gt=0)
