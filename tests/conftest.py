@@ -47,46 +47,12 @@ def tsmftis() -> Command:
     return command
 
 
-def tiny(folder: Path, **effects: dict[str, float]) -> Path:
-    """The demo preset cut down: 68 s of flight with a turn, two lines of 2 s with two panels, 48 × 64 pixels; with undeclared
-    effects, if any are named. Written into `folder`, its truth beside it."""
-    from stages import simulation
-
-    preset = simulation.SimulationSettings.preset("demo").model_dump()
-    preset["name"] = "tiny"
-    preset["effects"] = effects
-    preset["instrument"]["imu"]["rate_hz"] = 100.0
-    preset["instrument"]["camera"] |= {"rows": 48, "cols": 64, "principal_point_px": {"row": 23.8, "col": 31.1}}
-    preset["instrument"]["interferometer"]["zpd_col"] = 12.0
-    preset["flight"]["legs"] = [{"straight_s": 25.0}, {"turn_deg": 60.0, "bank_deg": 26.0}, {"straight_s": 25.0}]
-    preset["lines"] = [
-        {"id": "L01", "start_s": 15.0, "duration_s": 2.0, "panels": ["white", "red"]},
-        {"id": "L02", "start_s": 60.0, "duration_s": 2.0, "panels": ["grey", "holmium"]},
-    ]
-    preset["scene"] |= {"panel_margin_m": 12.0, "panel_scatter_m": 0.5, "cell_m": 0.5}
-    preset["terrain"]["margin_m"] = 40.0
-    preset["gcps"]["per_line"] = 6
-    for name in ("train", "verify"):
-        preset["chamber"][name]["stages"] = [
-            {"hold_min": 5.0},
-            {"to_degc": 40.0, "rate_k_per_min": 2.0},
-            {"hold_min": 5.0},
-            {"to_degc": 0.0, "rate_k_per_min": 3.0},
-        ]
-    simulation.write(simulation.run(simulation.SimulationSettings.model_validate(preset), 1), folder)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def simulated() -> Callable[..., Path]:
-    """`simulated(folder, camera_latency={"latency": …})`: a tiny campaign with undeclared effects."""
-    return tiny
-
-
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The tiny campaign without undeclared effects; tests must not change it."""
-    return tiny(tmp_path_factory.mktemp("demo") / "tiny")
+    """The tiny campaign (benchmarks/tiny_campaign.py) without undeclared effects; tests must not change it."""
+    from tiny_campaign import tiny_campaign
+
+    return tiny_campaign(tmp_path_factory.mktemp("demo") / "tiny", 1, {})
 
 
 @pytest.fixture(scope="session")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import yaml
+from tiny_campaign import tiny_campaign
 
 from pipeline.datasets import write_dataset
 from pipeline.model_update import read_model_update
@@ -111,8 +112,8 @@ def test_a_single_interferogram_is_the_instrument(laboratory: Path, tmp_path: Pa
     assert set(update.effects) == {"detector_nonlinearity"} and not update.bench
 
 
-def test_an_undeclared_camera_latency_is_traced_and_taken_out(tmp_path: Path, tsmftis: Any, simulated: Any) -> None:
-    campaign, out = simulated(tmp_path / "tiny", camera_latency={"latency": 0.012}), tmp_path / "loop"
+def test_an_undeclared_camera_latency_is_traced_and_taken_out(tmp_path: Path, tsmftis: Any) -> None:
+    campaign, out = tiny_campaign(tmp_path / "tiny", 1, {"camera_latency": {"latency": 0.012}}), tmp_path / "loop"
     answer = tsmftis("close-loop", campaign, "--out", out)
     assert answer.code == 0, answer.out + answer.err
     content = loop_of(out)
