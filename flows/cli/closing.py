@@ -23,6 +23,7 @@ FIGURES = {
     "rqe_area_tracking_mean": "RQE, area mean",
     "geometry_residual_px": "picked points [px]",
     "navigation_nis_mean": "NIS of the innovations",
+    "navigation_withheld_m": "withheld fixes, horizontal, vertical [m]",
     "thermal_gyro_std_deg_per_h": "gyros in the chamber [°/h]",
     "thermal_accel_std_ug": "accelerometers in the chamber [µg]",
     "bench_relative_rms": "bench spectrum, relative RMS",

@@ -10,19 +10,21 @@ bench_relative_rms                          bands of wavenumber held out in turn
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from flows.loop.problems import Part, inputs_of, lines_of
+from flows.loop.problems import Part, flight_of, inputs_of, lines_of, problem_of
 from flows.steps import Paths, Plan, plain, turn_on
 from pipeline.model_update import Effects
 from pipeline.records import Tracks
 from pipeline.run_stage import StageRecord, run_stage, write_json
-from stages import reconstruction, scoring, thermal
+from stages import closed_loop, navigation, reconstruction, scoring, thermal
 
+WITHHELD_S = (30.0, 5.0)
 Answers = Mapping[str, Mapping[str, Any]]
 
 
@@ -40,7 +42,7 @@ def held_out_step(
         figures["bench_relative_rms_each"] = each
     again = {
         name: answers[name]["without"]
-        for name in ("thermal", "spectral")
+        for name in ("thermal", "navigation", "spectral")
         if name in answers and answers[name]["without"]
     }
     inputs: dict[str, Path] = {}
@@ -53,6 +55,10 @@ def held_out_step(
             if "thermal" in again:
                 second.update(_thermal(after, again["thermal"][0]["effects"]))
                 how["thermal"] = "verification runs, with effects from the training runs alone"
+            if "navigation" in again:
+                effects = {n: dict(v) for n, v in answers["navigation"]["effects"].items()}
+                first["navigation_withheld_m"], second["navigation_withheld_m"] = _withheld(after, effects)
+                how["navigation"] = "5 of every 30 s of the fixes withheld, from the path and from the effects"
             if "spectral" in again:
                 figures, how["spectral"] = _spectral(after, again["spectral"])
                 second.update(figures)
@@ -64,7 +70,14 @@ def held_out_step(
         root,
         "loop",
         "held-out",
-        ("stages.thermal", "stages.reconstruction", "stages.scoring", "flows.loop.problems"),
+        (
+            "stages.thermal",
+            "stages.navigation",
+            "stages.closed_loop",
+            "stages.reconstruction",
+            "stages.scoring",
+            "flows.loop.problems",
+        ),
         {"figures": [first, second], "again": plain(again), "effects": plain(after.update.effects)},
         inputs,
         {"figures": "loop/held-out.json"},
@@ -99,6 +112,28 @@ def _thermal(plan: Plan, effects: Effects) -> dict[str, Any]:
     train, verify = ([plan.opened.chamber(n) for n in part] for part in (keys.train, keys.verify))
     table = thermal.run(train, verify, plan.settings.thermal, turn_on(plan.opened), effects).verification
     return {f"thermal_{key}": table[key][_method(plan)] for key in ("gyro_std_deg_per_h", "accel_std_ug")}
+
+
+def _withheld(plan: Plan, effects: Effects) -> tuple[list[float], list[float]]:
+    """RMS of the smoothed antenna's misses [m] before and after, horizontal and vertical, over all flights."""
+    settings = plan.settings.navigation.model_copy(update={"withhold_every_s": WITHHELD_S})
+    rest = {n: v for n, v in plan.update.effects.items() if n not in effects}
+    plan = replace(
+        plan,
+        settings=plan.settings.model_copy(update={"navigation": settings}),
+        update=replace(plan.update, effects=rest),
+    )
+    values, _ = closed_loop.refit(problem_of(plan, Part("navigation")), effects, [])
+    missed: list[dict[str, list[float]]] = []
+    for model in ({}, values):
+        each: dict[str, list[float]] = {"horizontal": [], "vertical": []}
+        for flight in plan.opened.keys.flights:
+            found = navigation.run(**flight_of(plan, flight.id), effects={**rest, **model}).quality["withheld"]
+            for name, squares in each.items():
+                squares.append(found[f"{name}_rms_m"] ** 2)
+        missed.append(each)
+    before, after = ([float(np.sqrt(np.mean(v))) for v in each.values()] for each in missed)
+    return before, after
 
 
 def _spectral(plan: Plan, halves: list[Mapping[str, Any]]) -> tuple[dict[str, float], str]:

@@ -9,6 +9,7 @@ parts_of      the parts that a campaign has data for, and why others are missing
 inputs_of     files that a part is made of
 problem_of    its residual problem
 picked_px     control points before and after
+flight_of, geometry_of     the records of a flight, of all lines
 settings_of   the settings that it hangs on
 """
 
@@ -154,28 +155,35 @@ def _thermal(plan: Plan) -> ResidualProblem:
     return thermal.residual_problem(train, verify, plan.settings.thermal, turn_on(plan.opened), plan.effects("thermal"))
 
 
-def _navigation(plan: Plan) -> ResidualProblem:
+def flight_of(plan: Plan, flight: str) -> dict[str, Any]:
+    """What `navigation.run` and `navigation.residual_problem` are made of, but for the effects."""
     campaign = plan.opened
     instrument = campaign.instrument
     assert instrument.imu is not None and instrument.mounting is not None
-    problems = {}
+    imu, method, correction = campaign.imu(flight), compensation(plan, flight), None
+    if method != "none" and imu.temperatures is not None:
+        known = thermal.ThermalModel.from_file(plan.out / "thermal_model.nc")
+        correction = known.correction(
+            imu.temperatures, method, of=imu.time, where=campaign.path(campaign.flight(flight).imu)
+        )
+    return {
+        "imu": imu,
+        "gnss": campaign.gnss(flight),
+        "model": instrument.imu,
+        "mounting": instrument.mounting,
+        "settings": plan.settings.navigation,
+        "initial": initial_attitude(campaign, flight),
+        "correction": correction,
+    }
+
+
+def _navigation(plan: Plan) -> ResidualProblem:
+    campaign, problems = plan.opened, {}
     for flight in campaign.keys.flights:
-        imu, method = campaign.imu(flight.id), compensation(plan, flight.id)
-        correction = None
-        if method != "none" and imu.temperatures is not None:
-            known = thermal.ThermalModel.from_file(plan.out / "thermal_model.nc")
-            correction = known.correction(imu.temperatures, method, of=imu.time, where=campaign.path(flight.imu))
         files = {"gnss": campaign.path(flight.gnss), "imu": campaign.path(flight.imu)}
         with naming(**files, **{"campaign.yaml": campaign.root / "campaign.yaml"}):
             problems[flight.id] = navigation.residual_problem(
-                imu,
-                campaign.gnss(flight.id),
-                instrument.imu,
-                instrument.mounting,
-                plan.settings.navigation,
-                initial=initial_attitude(campaign, flight.id),
-                correction=correction,
-                effects=plan.effects("navigation"),
+                **flight_of(plan, flight.id), effects=plan.effects("navigation")
             )
     return joined(problems)
 

@@ -36,6 +36,7 @@ FIGURES = (
     ("rqe_area_tracking_mean", "RQE of tracking, area mean, mean over targets"),
     ("geometry_residual_px", "picked points minus prediction, RMS [px]"),
     ("navigation_nis_mean", "NIS of the innovations, mean"),
+    ("navigation_withheld_m", "withheld fixes, RMS, horizontal, vertical [m]"),
     ("thermal_gyro_std_deg_per_h", "gyros in the chamber, 100 s means, x, y, z [°/h]"),
     ("thermal_accel_std_ug", "accelerometers in the chamber, x, y, z [µg]"),
     ("bench_relative_rms", "bench spectrum against the reference, relative RMS after one scale"),
