@@ -16,8 +16,10 @@ residual_problem    of all lines of a campaign
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +42,8 @@ Index = NDArray[np.int64]
 LEVEL_ORDER = 2  # at least
 FEWEST_COLUMNS = 48  # of an interferogram that says something
 SPARE = 0.06  # of the range of path differences that the table holds on either side
-TURNS = 3  # of Gauss–Newton on φ
+FIRST_TURNS, TURNS = 12, 2  # of φ, at the null and elsewhere
+REMEMBERED = 1024  # residuals
 PLAUSIBLE = {
     "opd_scale": 1e-3,
     "opd_quadratic": 1e-12,
@@ -122,7 +125,7 @@ def problem_of(
     labels = samples.interferogram
     return ResidualProblem(
         stage="spectral",
-        residual=model.residual,
+        residual=_remembering(model.residual),
         candidates=tuple(c for c in _candidates(model) if c.effect not in known),
         group=labels,
         series=labels,
@@ -169,17 +172,30 @@ class Model:
         levels = np.column_stack([own * (u**k / sigma)[:, None] for k in range(order + 1)])
         basis, _ = np.linalg.qr(levels)
         start = cls(samples, forward, calibration, interferometer, sigma, levels, basis)
-        return replace(start, phase=start.fitted_phase(start.first_phase(), {}, 12))
+        return replace(start, phase=start.first_phase())
 
     def cleared(self, columns: Array) -> Array:
         """Columns (n, …) without what the levels take up."""
         return columns - self.basis @ (self.basis.T @ columns)
 
+    @cached_property
+    def linear(self) -> Array:
+        """Signal (n,) over sigma, made linear as declared."""
+        return self._linear(self.interferometer.detector_nonlinearity)
+
+    def _linear(self, a: float) -> Array:
+        s = self.samples
+        return s.mean(detector.undo_nonlinearity(s.signal, a) / s.flat) / self.sigma
+
     def data(self, parameters: Parameters) -> Array:
         """Linear signal (n,) over sigma."""
-        s = self.samples
         a = self.interferometer.with_effects(parameters).detector_nonlinearity
-        return s.mean(detector.undo_nonlinearity(s.signal, a) / s.flat) / self.sigma
+        return self.linear if a == self.interferometer.detector_nonlinearity else self._linear(a)
+
+    @cached_property
+    def step(self) -> Array:
+        """(order + 1, n): what a residual says of the phase, at the null."""
+        return np.linalg.pinv(self.cleared(self.phase_columns()))
 
     def fringes(self, parameters: Parameters, phase: Array, derivatives: bool) -> Array:
         """Fringes over sigma, and their derivatives by the phase's coefficients (n, 1 or order + 2)."""
@@ -198,26 +214,25 @@ class Model:
         return np.stack(out, -1) * (blurred / self.sigma)[:, None]
 
     def first_phase(self) -> Array:
-        """Where to begin: the constant phase that fits best, of sixteen."""
-        zero = np.zeros(self.forward.order + 1)
-        y = self.cleared(self.data({}))
-        columns = self.fringes({}, zero, True)[:, :2]  # cos φ₀·I + sin φ₀·∂I/∂c₀
-        share = np.linalg.lstsq(self.cleared(columns), y, rcond=None)[0]
-        zero[0] = np.arctan2(share[1], share[0])
-        return zero
-
-    def fitted_phase(self, phase: Array, parameters: Parameters, turns: int) -> Array:
-        y = self.data(parameters)
-        for _ in range(turns):
-            columns = self.fringes(parameters, phase, True)
-            left = self.cleared(np.column_stack([y - columns[:, 0], columns[:, 1:]]))
-            phase = phase + np.linalg.lstsq(left[:, 1:], left[:, 0], rcond=None)[0]
+        """Where to begin: the constant phase that fits best, then Gauss–Newton."""
+        phase = np.zeros(self.forward.order + 1)
+        y = self.cleared(self.linear)
+        columns = self.cleared(self.fringes({}, phase, True)[:, :2])  # cos φ₀·I + sin φ₀·∂I/∂c₀
+        share = np.linalg.lstsq(columns, y, rcond=None)[0]
+        phase[0] = np.arctan2(share[1], share[0])
+        for _ in range(FIRST_TURNS):
+            left = self.cleared(self.fringes({}, phase, True))
+            phase = phase + np.linalg.lstsq(left[:, 1:], y - left[:, 0], rcond=None)[0]
         return phase
 
     def residual(self, parameters: Parameters) -> Array:
-        """r (n,) with levels and phase fitted."""
-        phase = self.fitted_phase(self.phase, parameters, TURNS)
-        return self.cleared(self.data(parameters) - self.fringes(parameters, phase, False)[:, 0])
+        """r (n,) with levels and phase fitted: the phase by steps with the derivatives at the null, which lead as far as is
+        needed, since what they leave of it lies along `phase_columns`."""
+        y, phase = self.cleared(self.data(parameters)), self.phase
+        for _ in range(TURNS):
+            left = y - self.cleared(self.fringes(parameters, phase, False)[:, 0])
+            phase = phase + self.step @ left
+        return y - self.cleared(self.fringes(parameters, phase, False)[:, 0])
 
     def phase_columns(self) -> Array:
         """∂r/∂c (n, order + 1) at the null."""
@@ -226,13 +241,24 @@ class Model:
     def covariates(self) -> dict[str, Array]:
         s = self.samples
         return {
-            "opd": self.interferometer.opd(s.row, s.col),
-            "column": s.col,
+            "OPD": self.interferometer.opd(s.row, s.col),
             "row": s.row,
             "signal level": (self.data({}) - self.residual({}))
             * self.sigma,  # as modelled: noise must not sort samples
             "time": s.time,
         }
+
+
+def _remembering(residual: Callable[[Parameters], Array]) -> Callable[[Parameters], Array]:
+    """The same function, which looks up what it was asked before: the loop asks for the signatures at the null twice."""
+
+    @lru_cache(REMEMBERED)
+    def of(key: tuple[tuple[str, tuple[tuple[str, float], ...]], ...]) -> Array:
+        value = residual({effect: dict(values) for effect, values in key})
+        value.flags.writeable = False
+        return value
+
+    return lambda parameters: of(tuple(sorted((e, tuple(sorted(v.items()))) for e, v in parameters.items())))
 
 
 def _candidates(model: Model) -> list[Candidate]:
@@ -306,7 +332,7 @@ def _samples(
     parts: Sequence[tuple[PanelPixels, Array, list[str], list[int]]], radiance: Array, cols: int
 ) -> tuple[PanelSamples, Array]:
     """The samples of targets with a reference and enough columns, and the spectra that occur (b, k)."""
-    chunks: dict[str, list[Array]] = {
+    chunks: dict[str, list[NDArray[Any]]] = {
         n: [] for n in ("signal", "flat", "row", "row_variance", "col", "time", "interferogram", "spectrum", "count")
     }
     names: list[str] = []
@@ -340,6 +366,6 @@ def _samples(
         )
     joined = {n: np.concatenate(values) for n, values in chunks.items()}
     count = joined.pop("count")
-    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    begins = np.concatenate([[0], np.cumsum(count)[:-1]])
     used, spectrum = np.unique(joined.pop("spectrum"), return_inverse=True)
-    return PanelSamples(start=start, spectrum=spectrum, names=tuple(names), **joined), radiance[used]
+    return PanelSamples(start=begins, spectrum=spectrum, names=tuple(names), **joined), radiance[used]
