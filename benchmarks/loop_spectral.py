@@ -151,10 +151,12 @@ def bounds(one: ResidualProblem) -> dict[str, float]:
         rest = FRINGE if name == "channel_fringe" else {}
         up, down = (one.residual({name: {**rest, key: sign * parameter.difference}}) for sign in (1.0, -1.0))
         columns[name] = (up - down) / (2.0 * parameter.difference)
-    x = np.column_stack([*columns.values(), one.nuisance])
-    size = np.linalg.norm(x, axis=0)
-    covariance = np.linalg.pinv((x / size).T @ (x / size), rcond=1e-12, hermitian=True)
-    return {name: float(np.sqrt(covariance[i, i]) / size[i]) for i, name in enumerate(columns)}
+    out = {}
+    for name, column in columns.items():
+        x = np.column_stack([one.nuisance, *(c for other, c in columns.items() if other != name)])
+        x = x / np.linalg.norm(x, axis=0)
+        out[name] = 1.0 / float(np.linalg.norm(column - x @ np.linalg.lstsq(x, column, rcond=None)[0]))
+    return out
 
 
 def at_size(sigma: Mapping[str, float], name: str, size: float) -> dict[str, dict[str, float]]:

@@ -44,14 +44,9 @@ FEWEST_COLUMNS = 48  # of an interferogram that says something
 SPARE = 0.06  # of the range of path differences that the table holds on either side
 FIRST_TURNS, TURNS = 12, 2  # of φ, at the null and elsewhere
 REMEMBERED = 1024  # residuals
-PLAUSIBLE = {
-    "opd_scale": 1e-3,
-    "opd_quadratic": 1e-12,
-    "fringe_tilt": 1e-9,
-    "detector_nonlinearity": 0.02,
-    "channel_fringe": 0.02,
-    "response_scale": 0.02,
-}
+WAVE = 0.1  # an error of the path difference at the end of the scan that is worth a name
+PLAUSIBLE = {"detector_nonlinearity": 0.02, "channel_fringe": 0.02, "response_scale": 0.02}
+PHASES = (0.0, np.pi / 3.0, 2.0 * np.pi / 3.0)  # of a fringe of either sign: at least 87 % of any
 
 
 @dataclass(frozen=True)
@@ -262,11 +257,19 @@ def _remembering(residual: Callable[[Parameters], Array]) -> Callable[[Parameter
 
 
 def _candidates(model: Model) -> list[Candidate]:
+    instrument, end = model.interferometer, WAVE / float(model.forward.wavenumber.mean())
+    farthest = float(np.abs(model.samples.col - instrument.zpd_col).max())
+    plausible = PLAUSIBLE | {
+        "opd_scale": end / (instrument.opd_step * farthest),
+        "opd_quadratic": end / farthest**2,
+        "fringe_tilt": end / (0.5 * instrument.rows),
+    }
     out = []
-    for name, plausible in PLAUSIBLE.items():
-        effect = EFFECTS[name]
+    for name, effect in EFFECTS.items():
+        if effect.stage != "spectral":
+            continue
         parameters = {
-            key: Parameter(unit, effect.largest[key], effect.least.get(key), plausible)
+            key: Parameter(unit, effect.largest[key], effect.least.get(key), plausible[name])
             for key, unit in effect.units.items()
         }
         grid: tuple[Mapping[str, float], ...] = ()
@@ -275,7 +278,7 @@ def _candidates(model: Model) -> list[Candidate]:
                 "thickness": Parameter("m", effect.largest["thickness"], 0.0, 1e-6, 1e-9),
                 "phase": Parameter("rad", effect.largest["phase"], None, 1.0, 1e-3),
             }
-            grid = tuple({"amplitude": plausible, "thickness": float(t)} for t in thicknesses(model))
+            grid = tuple({"thickness": float(t), "phase": p} for t in thicknesses(model) for p in PHASES)
         out.append(Candidate(name, parameters, grid))
     return out
 
