@@ -80,9 +80,7 @@ def made(given: Given, seed: int, panels: tuple[str, ...] = PANELS, lines: int =
             reconstruction.SpectralLine(frames, tracks, targets, f"L{i + 1}")
             for i, (frames, tracks, targets) in enumerate(flown)
         ],
-        "calibration": Calibration(
-            calibration.dark, calibration.flat, calibration.wavenumber, calibration.response
-        ),
+        "calibration": Calibration(calibration.dark, calibration.flat, calibration.wavenumber, calibration.response),
         "references": References(
             tuple(calibration.references), calibration.wavenumber, np.stack(list(calibration.references.values()))
         ),
@@ -115,7 +113,8 @@ def _line(
         col = SPEED * frame - 2.0 * HALF - k * APART
         row = 31.5 + 6.0 * np.sin(0.9 * k + rng.uniform(0.0, 6.0)) + wander - wander.mean()
         share = [
-            np.clip(HALF + 0.5 - np.abs(grid - centre[:, None]), 0.0, 1.0) for grid, centre in ((rows, row), (cols, col))
+            np.clip(HALF + 0.5 - np.abs(grid - centre[:, None]), 0.0, 1.0)
+            for grid, centre in ((rows, row), (cols, col))
         ]
         over = share[0][:, :, None] * share[1][:, None, :]
         ideal += over * (signal[names.index(panel)] - ideal)
@@ -159,8 +158,9 @@ def bounds(one: ResidualProblem) -> dict[str, float]:
     return out
 
 
-def at_size(sigma: Mapping[str, float], name: str, size: float) -> dict[str, dict[str, float]]:
-    """The effect at so many sigma."""
+def at_size(name: str, size: float, seed: int) -> dict[str, dict[str, float]]:
+    """The effect at so many sigma of the data set of this seed."""
+    sigma = bounds(problem({}, seed))
     rest = FRINGE if name == "channel_fringe" else {}
     return {name: {**rest, STRENGTH[name]: size * sigma[name]}}
 
@@ -181,17 +181,19 @@ def _clean(trials: int, seed: int) -> None:
         r = one.residual({})
         whole.append(r @ r / (r.size - one.nuisance.shape[1]))
     wrong = verdicts["effects_added"]
-    print(f"clean, {trials} data sets: {dict(verdicts)} {dict(added)}; {(time.perf_counter() - begun) / trials:.1f} s each")
+    print(
+        f"clean, {trials} data sets: {dict(verdicts)} {dict(added)}; {(time.perf_counter() - begun) / trials:.1f} s each"
+    )
     print(f"  false additions {wrong / trials:.1%}, at 95 % confidence under {most(wrong, trials):.1%}")
     print(f"  χ² per degree of freedom {np.mean(whole):.3f} ± {np.std(whole):.3f}", flush=True)
 
 
-def _found(name: str, sigma: Mapping[str, float], trials: int, seed: int) -> None:
+def _found(name: str, trials: int, seed: int) -> None:
     for size in (4.0, 8.0):
-        given = at_size(sigma, name, size)
         right = alone = 0
         answers, scores, share = Counter[str](), [], []
         for i in range(trials):
+            given = at_size(name, size, seed + 1000 + i)
             result = run(problem(given, seed + 1000 + i), LoopSettings(), i)
             told = [name in (s.effect, *s.indistinguishable_from) for s in result.steps]
             right += any(told)
@@ -202,19 +204,19 @@ def _found(name: str, sigma: Mapping[str, float], trials: int, seed: int) -> Non
                     value = step.parameters[STRENGTH[name]]
                     true = given[name][STRENGTH[name]]
                     scores.append((abs(value.value) - true) / value.sigma)
-                    share.append(value.sigma / sigma[name])
+                    share.append(value.sigma * size / true)
         spread = f"error/sigma rms {np.sqrt(np.mean(np.square(scores))):.2f}" if scores else ""
         spread += f", sigma/bound {np.median(share):.2f}" if share else ""
         listed = ", ".join(f"{n} {c}" for n, c in answers.most_common())
         print(f"{name:<22} {size:g} sigma: named {right}/{trials}, alone {alone}; {spread}; {listed}", flush=True)
 
 
-def _missing(name: str, sigma: Mapping[str, float], trials: int, seed: int) -> None:
+def _missing(name: str, trials: int, seed: int) -> None:
     size = 15.0
     forced = learned = 0
     answers = Counter[str]()
     for i in range(trials):
-        result = run(problem(at_size(sigma, name, size), seed + 2000 + i, name), LoopSettings(), i)
+        result = run(problem(at_size(name, size, seed + 2000 + i), seed + 2000 + i, name), LoopSettings(), i)
         names = [s.effect for s in result.steps]
         forced += any(not n.startswith("learned:") for n in names)
         learned += any(n.removeprefix("learned:") in COVARIATES[name] for n in names)
@@ -228,7 +230,9 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=20, help="data sets of an effect and size")
     parser.add_argument("--clean", type=int, default=60, help="data sets without an effect")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--part", nargs="*", default=["clean", "found", "missing"], choices=["clean", "found", "missing"])
+    parser.add_argument(
+        "--part", nargs="*", default=["clean", "found", "missing"], choices=["clean", "found", "missing"]
+    )
     parser.add_argument("--only", nargs="*", default=list(STRENGTH), choices=list(STRENGTH), metavar="EFFECT")
     a = parser.parse_args()
     sigma = bounds(problem({}, a.seed))
@@ -239,7 +243,7 @@ def main() -> None:
         if part in a.part:
             print(part if part == "found" else "not in the library")
             for name in a.only:
-                measure(name, sigma, a.trials, a.seed)
+                measure(name, a.trials, a.seed)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 """What the closed loop is offered of the flight's spectra: panels' pixels minus the interferogram of their reference.
 
-    r = [s(a) − level − Re ∫ R(σ)·B_ref(σ)·exp(i(2πσ·OPD(row, col) + φ(σ))) dσ]/sigma
+    r = [d − s·(1 − a·flat·s/12000)]/sigma,    s = level + Re ∫ R(σ)·B_ref(σ)·exp(i(2πσ·OPD(row, col) + φ(σ))) dσ
 
-s is the mean over the pixels inside a panel (`panel_pixels`) in one detector column, each after dark, made linear and divided
-by its flat; level a polynomial in the column, one for each interferogram; φ one polynomial in σ for the whole campaign. Level
-and φ are estimated anew at every set of parameters, so that what is linearised about is always near.
+d is the mean over the pixels inside a panel (`panel_pixels`) in one detector column, each after dark and divided by its flat;
+level a polynomial in the column, one for each interferogram; φ one polynomial in σ for the whole campaign. Level and φ are
+estimated anew at every set of parameters, so that what is linearised about is always near. The non-linearity acts on the model:
+data made linear would carry their own noise into the signature (measured: a spline of the signal beat the name in 2 of 6).
 
 A scale that panels have one by one (dirt, a panel lit askew) is none of the candidates: it makes `response_scale` change from
 group to group, which the loop reports as structure without a name. One that all references share is `response_scale` itself.
@@ -17,7 +18,7 @@ residual_problem    of all lines of a campaign
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -42,7 +43,7 @@ Index = NDArray[np.int64]
 LEVEL_ORDER = 2  # at least
 FEWEST_COLUMNS = 48  # of an interferogram that says something
 SPARE = 0.06  # of the range of path differences that the table holds on either side
-FIRST_TURNS, TURNS = 12, 2  # of φ, at the null and elsewhere
+FIRST_TURNS, TURNS, LEVEL_TURNS = 8, 2, 3  # of φ at the null and elsewhere, of the level at each
 REMEMBERED = 1024  # residuals
 WAVE = 0.1  # an error of the path difference at the end of the scan that is worth a name
 PLAUSIBLE = {"detector_nonlinearity": 0.02, "channel_fringe": 0.02, "response_scale": 0.02}
@@ -61,15 +62,15 @@ class SpectralLine:
 
 @dataclass(frozen=True)
 class PanelSamples:
-    """Interferograms of panels, sample by sample, ordered by interferogram and column.
+    """Interferograms of panels, sample by sample (n,), ordered by interferogram and column.
 
-    Pixels (m,): signal after dark, flat, line's frame time; `start` (n,): the first pixel of each sample. Samples (n,): mean row
-    and its variance, column, mean time. `interferogram` (n,) numbers them, `spectrum` (n,) the row of Forward.radiance.
+    value: mean over pixels of signal after dark over flat [DN], sigma its noise, flat the mean flat; mean row and its variance,
+    column, mean time; `interferogram` numbers them, `spectrum` is the row of Forward.radiance.
     """
 
-    signal: Array
+    value: Array
+    sigma: Array
     flat: Array
-    start: Index
     row: Array
     row_variance: Array
     col: Array
@@ -77,13 +78,6 @@ class PanelSamples:
     interferogram: Index
     spectrum: Index
     names: tuple[str, ...]
-
-    @property
-    def count(self) -> Array:
-        return np.diff(np.append(self.start, self.signal.size)).astype(float)
-
-    def mean(self, of_pixels: Array) -> Array:
-        return np.asarray(np.add.reduceat(of_pixels, self.start) / self.count)
 
 
 def residual_problem(
@@ -102,21 +96,20 @@ def residual_problem(
     settings = settings or ReconstructionSettings()
     known = {name: values for name, values in (effects or {}).items() if EFFECTS[name].stage == "spectral"}
     interferometer, calibration = interferometer.with_effects(known), calibration.with_effects(known)
-    samples, radiance, noise = _collect(lines, calibration, references, camera, settings)
-    return problem_of(samples, radiance, noise, calibration, interferometer, settings, tuple(known))
+    samples, radiance = _collect(lines, calibration, references, camera, settings)
+    return problem_of(samples, radiance, calibration, interferometer, settings, tuple(known))
 
 
 def problem_of(
     samples: PanelSamples,
     radiance: Array,
-    noise: tuple[float, float],
     calibration: Calibration,
     interferometer: Interferometer,
     settings: ReconstructionSettings,
     known: Sequence[str] = (),
 ) -> ResidualProblem:
-    """The problem of samples that are there; radiance (b, k) on the calibration's wavenumbers; noise: read² and gain [DN]."""
-    model = Model.of(samples, radiance, noise, calibration, interferometer, settings)
+    """The problem of samples that are there; radiance (b, k) on the calibration's wavenumbers."""
+    model = Model.of(samples, radiance, calibration, interferometer, settings)
     labels = samples.interferogram
     return ResidualProblem(
         stage="spectral",
@@ -135,62 +128,61 @@ def problem_of(
 
 @dataclass(frozen=True)
 class Model:
-    """The forward model of samples, their levels as columns (n, p) with an orthonormal basis of their span, sigma (n,)."""
+    """The forward model of samples: `levels` (n, p) their columns over sigma, `basis` orthonormal of the same span; at the null
+    the phase's coefficients and the level over sigma (n,)."""
 
     samples: PanelSamples
     forward: Forward
     calibration: Calibration
     interferometer: Interferometer
-    sigma: Array
     levels: Array
     basis: Array
-    phase: Array = field(default_factory=lambda: np.zeros(0))
+    phase: Array
+    level: Array
 
     @classmethod
     def of(
         cls,
         samples: PanelSamples,
         radiance: Array,
-        noise: tuple[float, float],
         calibration: Calibration,
         interferometer: Interferometer,
         settings: ReconstructionSettings,
     ) -> Model:
         opd = interferometer.opd(samples.row, samples.col)
         spare = SPARE * float(np.ptp(opd))
-        forward = Forward(calibration.wavenumber, radiance, opd.min() - spare, opd.max() + spare, settings.phase_order)
-        variance = (noise[0] + noise[1] * np.maximum(samples.signal, 0.0)) / samples.flat**2
-        sigma = np.sqrt(samples.mean(variance) / samples.count)
+        order = settings.phase_order
+        forward = Forward(calibration.wavenumber, radiance, opd.min() - spare, opd.max() + spare, order)
         u = 2.0 * samples.col / (interferometer.cols - 1) - 1.0
-        order = max(settings.drift_order, LEVEL_ORDER)
         own = samples.interferogram[:, None] == np.arange(len(samples.names))
-        levels = np.column_stack([own * (u**k / sigma)[:, None] for k in range(order + 1)])
+        powers = range(max(settings.drift_order, LEVEL_ORDER) + 1)
+        levels = np.column_stack([own * (u**k / samples.sigma)[:, None] for k in powers])
         basis, _ = np.linalg.qr(levels)
-        start = cls(samples, forward, calibration, interferometer, sigma, levels, basis)
-        return replace(start, phase=start.first_phase())
+        phase, level = np.zeros(order + 1), basis @ (basis.T @ (samples.value / samples.sigma))
+        start = cls(samples, forward, calibration, interferometer, levels, basis, phase, level)
+        # The constant phase that fits best first: cos φ₀·I + sin φ₀·∂I/∂c₀.
+        columns = start.cleared(start.fringes({}, phase, True)[:, :2])
+        share = np.linalg.lstsq(columns, start.cleared(start.data), rcond=None)[0]
+        start = replace(start, phase=np.append(np.arctan2(share[1], share[0]), np.zeros(order)))
+        for _ in range(FIRST_TURNS):
+            phase, level, _ = start.fitted({}, 1)
+            start = replace(start, phase=phase, level=level)
+        return start
+
+    @property
+    def data(self) -> Array:
+        """d over sigma (n,)."""
+        return self.samples.value / self.samples.sigma
 
     def cleared(self, columns: Array) -> Array:
         """Columns (n, …) without what the levels take up."""
-        return columns - self.basis @ (self.basis.T @ columns)
+        return np.asarray(columns - self.basis @ (self.basis.T @ columns), float)
 
-    @cached_property
-    def linear(self) -> Array:
-        """Signal (n,) over sigma, made linear as declared."""
-        return self._linear(self.interferometer.detector_nonlinearity)
-
-    def _linear(self, a: float) -> Array:
-        s = self.samples
-        return s.mean(detector.undo_nonlinearity(s.signal, a) / s.flat) / self.sigma
-
-    def data(self, parameters: Parameters) -> Array:
-        """Linear signal (n,) over sigma."""
+    def recorded(self, linear: Array, parameters: Parameters) -> Array:
+        """What the detector makes of a linear signal over sigma (n,)."""
         a = self.interferometer.with_effects(parameters).detector_nonlinearity
-        return self.linear if a == self.interferometer.detector_nonlinearity else self._linear(a)
-
-    @cached_property
-    def step(self) -> Array:
-        """(order + 1, n): what a residual says of the phase, at the null."""
-        return np.linalg.pinv(self.cleared(self.phase_columns()))
+        s = self.samples
+        return np.asarray(linear * (1.0 - a / detector.NONLINEARITY_SCALE * s.flat * s.sigma * linear), float)
 
     def fringes(self, parameters: Parameters, phase: Array, derivatives: bool) -> Array:
         """Fringes over sigma, and their derivatives by the phase's coefficients (n, 1 or order + 2)."""
@@ -200,34 +192,34 @@ class Model:
         forward = self.forward
         if opd.min() < forward.low or opd.max() > forward.high:
             forward = replace(forward, low=min(forward.low, opd.min()), high=max(forward.high, opd.max()))
-        out = []
         each, spectrum = np.arange(opd.size), self.samples.spectrum
-        for table in forward.tables(response, phase, derivatives):
-            out.append(table(opd)[each, spectrum])
+        out = np.stack([t(opd)[each, spectrum] for t in forward.tables(response, phase, derivatives)], -1)
         middle = 2.0 * np.pi * float(forward.wavenumber.mean()) * instrument.fringe_tilt
         blurred = np.exp(-0.5 * middle**2 * self.samples.row_variance)
-        return np.stack(out, -1) * (blurred / self.sigma)[:, None]
+        return np.asarray(out * (blurred / self.samples.sigma)[:, None], float)
 
-    def first_phase(self) -> Array:
-        """Where to begin: the constant phase that fits best, then Gauss–Newton."""
-        phase = np.zeros(self.forward.order + 1)
-        y = self.cleared(self.linear)
-        columns = self.cleared(self.fringes({}, phase, True)[:, :2])  # cos φ₀·I + sin φ₀·∂I/∂c₀
-        share = np.linalg.lstsq(columns, y, rcond=None)[0]
-        phase[0] = np.arctan2(share[1], share[0])
-        for _ in range(FIRST_TURNS):
-            left = self.cleared(self.fringes({}, phase, True))
-            phase = phase + np.linalg.lstsq(left[:, 1:], y - left[:, 0], rcond=None)[0]
-        return phase
+    @cached_property
+    def step(self) -> Array:
+        """(order + 1, n): what a residual says of the phase, at the null."""
+        return np.linalg.pinv(self.cleared(self.phase_columns()))
+
+    def fitted(self, parameters: Parameters, turns: int) -> tuple[Array, Array, Array]:
+        """Phase, level and r (n,) with both fitted, by steps with the derivatives at the null: what they leave lies along the
+        nuisance's columns."""
+        phase, level = self.phase, self.level
+        for turn in range(turns + 1):
+            fringes = self.fringes(parameters, phase, False)[:, 0]
+            for _ in range(LEVEL_TURNS):
+                left = self.data - self.recorded(level + fringes, parameters)
+                level = level + self.basis @ (self.basis.T @ left)
+            left = self.data - self.recorded(level + fringes, parameters)
+            if turn < turns:
+                phase = phase + self.step @ left
+        return phase, level, left
 
     def residual(self, parameters: Parameters) -> Array:
-        """r (n,) with levels and phase fitted: the phase by steps with the derivatives at the null, which lead as far as is
-        needed, since what they leave of it lies along `phase_columns`."""
-        y, phase = self.cleared(self.data(parameters)), self.phase
-        for _ in range(TURNS):
-            left = y - self.cleared(self.fringes(parameters, phase, False)[:, 0])
-            phase = phase + self.step @ left
-        return y - self.cleared(self.fringes(parameters, phase, False)[:, 0])
+        """r (n,)."""
+        return self.fitted(parameters, TURNS)[2]
 
     def phase_columns(self) -> Array:
         """∂r/∂c (n, order + 1) at the null."""
@@ -238,8 +230,7 @@ class Model:
         return {
             "OPD": self.interferometer.opd(s.row, s.col),
             "row": s.row,
-            "signal level": (self.data({}) - self.residual({}))
-            * self.sigma,  # as modelled: noise must not sort samples
+            "signal level": (self.level + self.fringes({}, self.phase, False)[:, 0]) * s.sigma,
             "time": s.time,
         }
 
@@ -300,7 +291,7 @@ def _collect(
     references: References | None,
     camera: Camera,
     settings: ReconstructionSettings,
-) -> tuple[PanelSamples, Array, tuple[float, float]]:
+) -> tuple[PanelSamples, Array]:
     if references is None:
         raise InputError(
             "references", "file", "is missing", "spectra can be held against nothing: name one in campaign.yaml"
@@ -320,7 +311,7 @@ def _collect(
         names = [f"{line.name} {t}".strip() for t in line.targets.ids]
         inside = pixels.part(pixels.distance <= reach[pixels.target])
         parts.append((inside, line.frames.time, names, spectra))
-    return (*_samples(parts, radiance, camera.cols), noise)
+    return _samples(parts, radiance, noise)
 
 
 def _joined(parts: Sequence[PanelPixels]) -> PanelPixels:
@@ -332,12 +323,11 @@ def _joined(parts: Sequence[PanelPixels]) -> PanelPixels:
 
 
 def _samples(
-    parts: Sequence[tuple[PanelPixels, Array, list[str], list[int]]], radiance: Array, cols: int
+    parts: Sequence[tuple[PanelPixels, Array, list[str], list[int]]], radiance: Array, noise: tuple[float, float]
 ) -> tuple[PanelSamples, Array]:
-    """The samples of targets with a reference and enough columns, and the spectra that occur (b, k)."""
-    chunks: dict[str, list[NDArray[Any]]] = {
-        n: [] for n in ("signal", "flat", "row", "row_variance", "col", "time", "interferogram", "spectrum", "count")
-    }
+    """The samples of targets with a reference and enough columns, and the spectra that occur (b, k); noise: read², gain [DN]."""
+    of_samples = [f.name for f in fields(PanelSamples) if f.name != "names"]
+    chunks: dict[str, list[NDArray[Any]]] = {n: [] for n in of_samples}
     names: list[str] = []
     for pixels, time, labels, spectra in parts:
         for t, label in enumerate(labels):
@@ -345,18 +335,19 @@ def _samples(
             seen, start, count = np.unique(pixels.col[mine], return_index=True, return_counts=True)
             if spectra[t] < 0 or seen.size < FEWEST_COLUMNS:
                 continue
-            row = pixels.row[mine].astype(float)
+            row, signal, flat = pixels.row[mine].astype(float), pixels.signal[mine], pixels.flat[mine]
             mean = np.add.reduceat(row, start) / count
+            variance = (noise[0] + noise[1] * np.maximum(signal, 0.0)) / flat**2
             for key, value in (
-                ("signal", pixels.signal[mine]),
-                ("flat", pixels.flat[mine]),
+                ("value", np.add.reduceat(signal / flat, start) / count),
+                ("sigma", np.sqrt(np.add.reduceat(variance, start)) / count),
+                ("flat", np.add.reduceat(flat, start) / count),
                 ("row", mean),
-                ("row_variance", np.add.reduceat(row**2, start) / count - mean**2),
+                ("row_variance", np.maximum(np.add.reduceat(row**2, start) / count - mean**2, 0.0)),
                 ("col", seen.astype(float)),
                 ("time", np.add.reduceat(time[pixels.frame[mine]], start) / count),
                 ("interferogram", np.full(seen.size, len(names))),
                 ("spectrum", np.full(seen.size, spectra[t])),
-                ("count", count),
             ):
                 chunks[key].append(value)
             names.append(label)
@@ -368,7 +359,5 @@ def _samples(
             "the panels must be over three pixels wide, cross the detector, and have spectra in references.nc",
         )
     joined = {n: np.concatenate(values) for n, values in chunks.items()}
-    count = joined.pop("count")
-    begins = np.concatenate([[0], np.cumsum(count)[:-1]])
     used, spectrum = np.unique(joined.pop("spectrum"), return_inverse=True)
-    return PanelSamples(start=begins, spectrum=spectrum, names=tuple(names), **joined), radiance[used]
+    return PanelSamples(spectrum=spectrum, names=tuple(names), **joined), radiance[used]
