@@ -1,10 +1,11 @@
 """What the closed loop is offered of the flight's spectra: panels' pixels minus the interferogram of their reference.
 
-    r = [s(a) − level − Re ∫ R(σ)·B_ref(σ)·exp(i(2πσ·OPD(row, col) + φ(σ))) dσ]/sigma
+    r = [d − s·(1 − a·flat·s/12000)]/sigma,    s = level + Re ∫ R(σ)·B_ref(σ)·exp(i(2πσ·OPD(row, col) + φ(σ))) dσ
 
-s is the mean over the pixels inside a panel (`panel_pixels`) in one detector column, each after dark, made linear and divided
-by its flat; level a polynomial in the column, one for each interferogram; φ one polynomial in σ for the whole campaign. Level
-and φ are estimated anew at every set of parameters, so that what is linearised about is always near.
+d is the mean over the pixels inside a panel (`panel_pixels`) in one detector column, each after dark and divided by its flat;
+level a polynomial in the column, one for each interferogram; φ one polynomial in σ for the whole campaign. Level and φ are
+estimated anew at every set of parameters, so that what is linearised about is always near. The non-linearity acts on the model:
+data made linear would carry their own noise into the signature (measured: a spline of the signal beat the name in 2 of 6).
 
 A scale that panels have one by one (dirt, a panel lit askew) is none of the candidates: it makes `response_scale` change from
 group to group, which the loop reports as structure without a name. One that all references share is `response_scale` itself.
@@ -16,8 +17,10 @@ residual_problem    of all lines of a campaign
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,15 +43,11 @@ Index = NDArray[np.int64]
 LEVEL_ORDER = 2  # at least
 FEWEST_COLUMNS = 48  # of an interferogram that says something
 SPARE = 0.06  # of the range of path differences that the table holds on either side
-TURNS = 3  # of Gauss–Newton on φ
-PLAUSIBLE = {
-    "opd_scale": 1e-3,
-    "opd_quadratic": 1e-12,
-    "fringe_tilt": 1e-9,
-    "detector_nonlinearity": 0.02,
-    "channel_fringe": 0.02,
-    "response_scale": 0.02,
-}
+FIRST_TURNS, TURNS, LEVEL_TURNS = 8, 2, 3  # of φ at the null and elsewhere, of the level at each
+REMEMBERED = 1024  # residuals
+WAVE = 0.1  # an error of the path difference at the end of the scan that is worth a name
+PLAUSIBLE = {"detector_nonlinearity": 0.02, "channel_fringe": 0.02, "response_scale": 0.02}
+PHASES = (0.0, np.pi / 3.0, 2.0 * np.pi / 3.0)  # of a fringe of either sign: at least 87 % of any
 
 
 @dataclass(frozen=True)
@@ -63,15 +62,15 @@ class SpectralLine:
 
 @dataclass(frozen=True)
 class PanelSamples:
-    """Interferograms of panels, sample by sample, ordered by interferogram and column.
+    """Interferograms of panels, sample by sample (n,), ordered by interferogram and column.
 
-    Pixels (m,): signal after dark, flat, line's frame time; `start` (n,): the first pixel of each sample. Samples (n,): mean row
-    and its variance, column, mean time. `interferogram` (n,) numbers them, `spectrum` (n,) the row of Forward.radiance.
+    value: mean over pixels of signal after dark over flat [DN], sigma its noise, flat the mean flat; mean row and its variance,
+    column, mean time; `interferogram` numbers them, `spectrum` is the row of Forward.radiance.
     """
 
-    signal: Array
+    value: Array
+    sigma: Array
     flat: Array
-    start: Index
     row: Array
     row_variance: Array
     col: Array
@@ -79,13 +78,6 @@ class PanelSamples:
     interferogram: Index
     spectrum: Index
     names: tuple[str, ...]
-
-    @property
-    def count(self) -> Array:
-        return np.diff(np.append(self.start, self.signal.size)).astype(float)
-
-    def mean(self, of_pixels: Array) -> Array:
-        return np.asarray(np.add.reduceat(of_pixels, self.start) / self.count)
 
 
 def residual_problem(
@@ -104,25 +96,24 @@ def residual_problem(
     settings = settings or ReconstructionSettings()
     known = {name: values for name, values in (effects or {}).items() if EFFECTS[name].stage == "spectral"}
     interferometer, calibration = interferometer.with_effects(known), calibration.with_effects(known)
-    samples, radiance, noise = _collect(lines, calibration, references, camera, settings)
-    return problem_of(samples, radiance, noise, calibration, interferometer, settings, tuple(known))
+    samples, radiance = _collect(lines, calibration, references, camera, settings)
+    return problem_of(samples, radiance, calibration, interferometer, settings, tuple(known))
 
 
 def problem_of(
     samples: PanelSamples,
     radiance: Array,
-    noise: tuple[float, float],
     calibration: Calibration,
     interferometer: Interferometer,
     settings: ReconstructionSettings,
     known: Sequence[str] = (),
 ) -> ResidualProblem:
-    """The problem of samples that are there; radiance (b, k) on the calibration's wavenumbers; noise: read² and gain [DN]."""
-    model = Model.of(samples, radiance, noise, calibration, interferometer, settings)
+    """The problem of samples that are there; radiance (b, k) on the calibration's wavenumbers."""
+    model = Model.of(samples, radiance, calibration, interferometer, settings)
     labels = samples.interferogram
     return ResidualProblem(
         stage="spectral",
-        residual=model.residual,
+        residual=_remembering(model.residual),
         candidates=tuple(c for c in _candidates(model) if c.effect not in known),
         group=labels,
         series=labels,
@@ -137,49 +128,61 @@ def problem_of(
 
 @dataclass(frozen=True)
 class Model:
-    """The forward model of samples, their levels as columns (n, p) with an orthonormal basis of their span, sigma (n,)."""
+    """The forward model of samples: `levels` (n, p) their columns over sigma, `basis` orthonormal of the same span; at the null
+    the phase's coefficients and the level over sigma (n,)."""
 
     samples: PanelSamples
     forward: Forward
     calibration: Calibration
     interferometer: Interferometer
-    sigma: Array
     levels: Array
     basis: Array
-    phase: Array = field(default_factory=lambda: np.zeros(0))
+    phase: Array
+    level: Array
 
     @classmethod
     def of(
         cls,
         samples: PanelSamples,
         radiance: Array,
-        noise: tuple[float, float],
         calibration: Calibration,
         interferometer: Interferometer,
         settings: ReconstructionSettings,
     ) -> Model:
         opd = interferometer.opd(samples.row, samples.col)
         spare = SPARE * float(np.ptp(opd))
-        forward = Forward(calibration.wavenumber, radiance, opd.min() - spare, opd.max() + spare, settings.phase_order)
-        variance = (noise[0] + noise[1] * np.maximum(samples.signal, 0.0)) / samples.flat**2
-        sigma = np.sqrt(samples.mean(variance) / samples.count)
+        order = settings.phase_order
+        forward = Forward(calibration.wavenumber, radiance, opd.min() - spare, opd.max() + spare, order)
         u = 2.0 * samples.col / (interferometer.cols - 1) - 1.0
-        order = max(settings.drift_order, LEVEL_ORDER)
         own = samples.interferogram[:, None] == np.arange(len(samples.names))
-        levels = np.column_stack([own * (u**k / sigma)[:, None] for k in range(order + 1)])
+        powers = range(max(settings.drift_order, LEVEL_ORDER) + 1)
+        levels = np.column_stack([own * (u**k / samples.sigma)[:, None] for k in powers])
         basis, _ = np.linalg.qr(levels)
-        start = cls(samples, forward, calibration, interferometer, sigma, levels, basis)
-        return replace(start, phase=start.fitted_phase(start.first_phase(), {}, 12))
+        phase, level = np.zeros(order + 1), basis @ (basis.T @ (samples.value / samples.sigma))
+        start = cls(samples, forward, calibration, interferometer, levels, basis, phase, level)
+        # The constant phase that fits best first: cos φ₀·I + sin φ₀·∂I/∂c₀.
+        columns = start.cleared(start.fringes({}, phase, True)[:, :2])
+        share = np.linalg.lstsq(columns, start.cleared(start.data), rcond=None)[0]
+        start = replace(start, phase=np.append(np.arctan2(share[1], share[0]), np.zeros(order)))
+        for _ in range(FIRST_TURNS):
+            phase, level, _ = start.fitted({}, 1)
+            start = replace(start, phase=phase, level=level)
+        return start
+
+    @property
+    def data(self) -> Array:
+        """d over sigma (n,)."""
+        return self.samples.value / self.samples.sigma
 
     def cleared(self, columns: Array) -> Array:
         """Columns (n, …) without what the levels take up."""
-        return columns - self.basis @ (self.basis.T @ columns)
+        return np.asarray(columns - self.basis @ (self.basis.T @ columns), float)
 
-    def data(self, parameters: Parameters) -> Array:
-        """Linear signal (n,) over sigma."""
-        s = self.samples
+    def recorded(self, linear: Array, parameters: Parameters) -> Array:
+        """What the detector makes of a linear signal over sigma (n,)."""
         a = self.interferometer.with_effects(parameters).detector_nonlinearity
-        return s.mean(detector.undo_nonlinearity(s.signal, a) / s.flat) / self.sigma
+        s = self.samples
+        return np.asarray(linear * (1.0 - a / detector.NONLINEARITY_SCALE * s.flat * s.sigma * linear), float)
 
     def fringes(self, parameters: Parameters, phase: Array, derivatives: bool) -> Array:
         """Fringes over sigma, and their derivatives by the phase's coefficients (n, 1 or order + 2)."""
@@ -189,35 +192,34 @@ class Model:
         forward = self.forward
         if opd.min() < forward.low or opd.max() > forward.high:
             forward = replace(forward, low=min(forward.low, opd.min()), high=max(forward.high, opd.max()))
-        out = []
         each, spectrum = np.arange(opd.size), self.samples.spectrum
-        for table in forward.tables(response, phase, derivatives):
-            out.append(table(opd)[each, spectrum])
+        out = np.stack([t(opd)[each, spectrum] for t in forward.tables(response, phase, derivatives)], -1)
         middle = 2.0 * np.pi * float(forward.wavenumber.mean()) * instrument.fringe_tilt
         blurred = np.exp(-0.5 * middle**2 * self.samples.row_variance)
-        return np.stack(out, -1) * (blurred / self.sigma)[:, None]
+        return np.asarray(out * (blurred / self.samples.sigma)[:, None], float)
 
-    def first_phase(self) -> Array:
-        """Where to begin: the constant phase that fits best, of sixteen."""
-        zero = np.zeros(self.forward.order + 1)
-        y = self.cleared(self.data({}))
-        columns = self.fringes({}, zero, True)[:, :2]  # cos φ₀·I + sin φ₀·∂I/∂c₀
-        share = np.linalg.lstsq(self.cleared(columns), y, rcond=None)[0]
-        zero[0] = np.arctan2(share[1], share[0])
-        return zero
+    @cached_property
+    def step(self) -> Array:
+        """(order + 1, n): what a residual says of the phase, at the null."""
+        return np.linalg.pinv(self.cleared(self.phase_columns()))
 
-    def fitted_phase(self, phase: Array, parameters: Parameters, turns: int) -> Array:
-        y = self.data(parameters)
-        for _ in range(turns):
-            columns = self.fringes(parameters, phase, True)
-            left = self.cleared(np.column_stack([y - columns[:, 0], columns[:, 1:]]))
-            phase = phase + np.linalg.lstsq(left[:, 1:], left[:, 0], rcond=None)[0]
-        return phase
+    def fitted(self, parameters: Parameters, turns: int) -> tuple[Array, Array, Array]:
+        """Phase, level and r (n,) with both fitted, by steps with the derivatives at the null: what they leave lies along the
+        nuisance's columns."""
+        phase, level = self.phase, self.level
+        for turn in range(turns + 1):
+            fringes = self.fringes(parameters, phase, False)[:, 0]
+            for _ in range(LEVEL_TURNS):
+                left = self.data - self.recorded(level + fringes, parameters)
+                level = level + self.basis @ (self.basis.T @ left)
+            left = self.data - self.recorded(level + fringes, parameters)
+            if turn < turns:
+                phase = phase + self.step @ left
+        return phase, level, left
 
     def residual(self, parameters: Parameters) -> Array:
-        """r (n,) with levels and phase fitted."""
-        phase = self.fitted_phase(self.phase, parameters, TURNS)
-        return self.cleared(self.data(parameters) - self.fringes(parameters, phase, False)[:, 0])
+        """r (n,)."""
+        return self.fitted(parameters, TURNS)[2]
 
     def phase_columns(self) -> Array:
         """∂r/∂c (n, order + 1) at the null."""
@@ -226,21 +228,39 @@ class Model:
     def covariates(self) -> dict[str, Array]:
         s = self.samples
         return {
-            "opd": self.interferometer.opd(s.row, s.col),
-            "column": s.col,
+            "OPD": self.interferometer.opd(s.row, s.col),
             "row": s.row,
-            "signal level": (self.data({}) - self.residual({}))
-            * self.sigma,  # as modelled: noise must not sort samples
+            "signal level": (self.level + self.fringes({}, self.phase, False)[:, 0]) * s.sigma,
             "time": s.time,
         }
 
 
+def _remembering(residual: Callable[[Parameters], Array]) -> Callable[[Parameters], Array]:
+    """The same function, which looks up what it was asked before: the loop asks for the signatures at the null twice."""
+
+    @lru_cache(REMEMBERED)
+    def of(key: tuple[tuple[str, tuple[tuple[str, float], ...]], ...]) -> Array:
+        value = residual({effect: dict(values) for effect, values in key})
+        value.flags.writeable = False
+        return value
+
+    return lambda parameters: of(tuple(sorted((e, tuple(sorted(v.items()))) for e, v in parameters.items())))
+
+
 def _candidates(model: Model) -> list[Candidate]:
+    instrument, end = model.interferometer, WAVE / float(model.forward.wavenumber.mean())
+    farthest = float(np.abs(model.samples.col - instrument.zpd_col).max())
+    plausible = PLAUSIBLE | {
+        "opd_scale": end / (instrument.opd_step * farthest),
+        "opd_quadratic": end / farthest**2,
+        "fringe_tilt": end / (0.5 * instrument.rows),
+    }
     out = []
-    for name, plausible in PLAUSIBLE.items():
-        effect = EFFECTS[name]
+    for name, effect in EFFECTS.items():
+        if effect.stage != "spectral":
+            continue
         parameters = {
-            key: Parameter(unit, effect.largest[key], effect.least.get(key), plausible)
+            key: Parameter(unit, effect.largest[key], effect.least.get(key), plausible[name])
             for key, unit in effect.units.items()
         }
         grid: tuple[Mapping[str, float], ...] = ()
@@ -249,7 +269,7 @@ def _candidates(model: Model) -> list[Candidate]:
                 "thickness": Parameter("m", effect.largest["thickness"], 0.0, 1e-6, 1e-9),
                 "phase": Parameter("rad", effect.largest["phase"], None, 1.0, 1e-3),
             }
-            grid = tuple({"amplitude": plausible, "thickness": float(t)} for t in thicknesses(model))
+            grid = tuple({"thickness": float(t), "phase": p} for t in thicknesses(model) for p in PHASES)
         out.append(Candidate(name, parameters, grid))
     return out
 
@@ -271,7 +291,7 @@ def _collect(
     references: References | None,
     camera: Camera,
     settings: ReconstructionSettings,
-) -> tuple[PanelSamples, Array, tuple[float, float]]:
+) -> tuple[PanelSamples, Array]:
     if references is None:
         raise InputError(
             "references", "file", "is missing", "spectra can be held against nothing: name one in campaign.yaml"
@@ -291,7 +311,7 @@ def _collect(
         names = [f"{line.name} {t}".strip() for t in line.targets.ids]
         inside = pixels.part(pixels.distance <= reach[pixels.target])
         parts.append((inside, line.frames.time, names, spectra))
-    return (*_samples(parts, radiance, camera.cols), noise)
+    return _samples(parts, radiance, noise)
 
 
 def _joined(parts: Sequence[PanelPixels]) -> PanelPixels:
@@ -303,12 +323,11 @@ def _joined(parts: Sequence[PanelPixels]) -> PanelPixels:
 
 
 def _samples(
-    parts: Sequence[tuple[PanelPixels, Array, list[str], list[int]]], radiance: Array, cols: int
+    parts: Sequence[tuple[PanelPixels, Array, list[str], list[int]]], radiance: Array, noise: tuple[float, float]
 ) -> tuple[PanelSamples, Array]:
-    """The samples of targets with a reference and enough columns, and the spectra that occur (b, k)."""
-    chunks: dict[str, list[Array]] = {
-        n: [] for n in ("signal", "flat", "row", "row_variance", "col", "time", "interferogram", "spectrum", "count")
-    }
+    """The samples of targets with a reference and enough columns, and the spectra that occur (b, k); noise: read², gain [DN]."""
+    of_samples = [f.name for f in fields(PanelSamples) if f.name != "names"]
+    chunks: dict[str, list[NDArray[Any]]] = {n: [] for n in of_samples}
     names: list[str] = []
     for pixels, time, labels, spectra in parts:
         for t, label in enumerate(labels):
@@ -316,18 +335,19 @@ def _samples(
             seen, start, count = np.unique(pixels.col[mine], return_index=True, return_counts=True)
             if spectra[t] < 0 or seen.size < FEWEST_COLUMNS:
                 continue
-            row = pixels.row[mine].astype(float)
+            row, signal, flat = pixels.row[mine].astype(float), pixels.signal[mine], pixels.flat[mine]
             mean = np.add.reduceat(row, start) / count
+            variance = (noise[0] + noise[1] * np.maximum(signal, 0.0)) / flat**2
             for key, value in (
-                ("signal", pixels.signal[mine]),
-                ("flat", pixels.flat[mine]),
+                ("value", np.add.reduceat(signal / flat, start) / count),
+                ("sigma", np.sqrt(np.add.reduceat(variance, start)) / count),
+                ("flat", np.add.reduceat(flat, start) / count),
                 ("row", mean),
-                ("row_variance", np.add.reduceat(row**2, start) / count - mean**2),
+                ("row_variance", np.maximum(np.add.reduceat(row**2, start) / count - mean**2, 0.0)),
                 ("col", seen.astype(float)),
                 ("time", np.add.reduceat(time[pixels.frame[mine]], start) / count),
                 ("interferogram", np.full(seen.size, len(names))),
                 ("spectrum", np.full(seen.size, spectra[t])),
-                ("count", count),
             ):
                 chunks[key].append(value)
             names.append(label)
@@ -339,7 +359,5 @@ def _samples(
             "the panels must be over three pixels wide, cross the detector, and have spectra in references.nc",
         )
     joined = {n: np.concatenate(values) for n, values in chunks.items()}
-    count = joined.pop("count")
-    start = np.concatenate([[0], np.cumsum(count)[:-1]])
     used, spectrum = np.unique(joined.pop("spectrum"), return_inverse=True)
-    return PanelSamples(start=start, spectrum=spectrum, names=tuple(names), **joined), radiance[used]
+    return PanelSamples(spectrum=spectrum, names=tuple(names), **joined), radiance[used]
