@@ -57,6 +57,7 @@ SIGMAS = 5.0  # of the declared scale factor's: a size worth naming
 MINUTE, SHORTEST, GROUPS = 60.0, 15.0, 8  # s, s: what is held out is a minute, or an eighth of a shorter flight
 FEWEST_FIXES = 20
 KEPT = 8  # linearisations in memory
+EXACT = 1e-6  # relative, of a step
 PHASE = 5e-3  # s: within it a vibration of 25 Hz is a linear matter
 COMPONENTS = ("north", "east", "down", "north velocity", "east velocity", "down velocity")
 
@@ -88,10 +89,11 @@ class Innovations:
     def __call__(self, parameters: Parameters) -> Array:
         at = np.array([parameters.get(effect, {}).get(name, 0.0) for effect, name in self.order])
         for key, one in reversed(self.kept.items()):
-            off = at - one.theta
-            if np.count_nonzero(off) <= 1 and (np.abs(off) <= 1.001 * self.steps).all():
+            off = (at - one.theta) / self.steps
+            moved = off[off != 0.0]
+            if moved.size == 0 or (moved.size == 1 and abs(abs(moved[0]) - 1.0) < EXACT):
                 self.kept.move_to_end(key)
-                return np.asarray(one.residual - one.signatures @ off)
+                return np.asarray(one.residual - one.signatures @ (off * self.steps))
         made = self.at(at)
         self.kept[at.tobytes()] = made
         if len(self.kept) > KEPT:
@@ -121,15 +123,26 @@ class Innovations:
             return np.asarray(np.einsum("kij,kjq->ikq", root, carried[fixes, :m]).reshape(y.size, -1))
 
         s = signatures(np.zeros((store.rows.size, 3)))
-        smooth_latency = s[:, self._latency]
-        power = max(float(smooth_latency @ smooth_latency), 1e-300)
-        if abs(smooth_latency @ y.ravel()) / power + 2.0 / np.sqrt(power) < PHASE:
+        off, sigma = _beside_all(s, y.ravel(), self._latency)
+        if abs(off) + 2.0 * sigma < PHASE:
             s = signatures(_jolts(problem, gathered, count, store))
         return Linearisation(at, y.ravel(), s)
 
     @property
     def _latency(self) -> int:
         return self.order.index(("gnss_latency", "latency"))
+
+
+def _beside_all(signatures: Array, residual: Array, column: int) -> tuple[float, float]:
+    """What the residual says of one parameter with all others estimated, and its sigma; (0, ∞) where it says nothing."""
+    size = np.linalg.norm(signatures, axis=0)
+    if not np.isfinite(residual).all() or not size[column] > 0.0:
+        return 0.0, float("inf")
+    seen = np.flatnonzero(size > 0.0)
+    scaled = signatures[:, seen] / size[seen]
+    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-10, hermitian=True)
+    at = int(np.searchsorted(seen, column))
+    return float(inverse[at] @ (scaled.T @ residual)) / size[column], float(np.sqrt(inverse[at, at])) / size[column]
 
 
 def _jolts(problem: Problem, gathered: Gathered, count: int, store: kalman.Store) -> Array:
