@@ -171,7 +171,9 @@ def main() -> None:
                 p = problem(grade, path, base + 3000 + i, one_axis(grade, path, effect, i, WITHOUT))
                 p = replace(p, candidates=tuple(c for c in p.candidates if c.effect != effect))
                 answers[answer(run(p, settings, i))] += 1
-            print(f"  {grade.name:<6}{effect:<22}" + ", ".join(f"{n} {c}" for n, c in answers.most_common()), flush=True)
+            print(
+                f"  {grade.name:<6}{effect:<22}" + ", ".join(f"{n} {c}" for n, c in answers.most_common()), flush=True
+            )
 
 
 if __name__ == "__main__":

@@ -49,7 +49,9 @@ Array = NDArray[np.float64]
 
 CANDIDATES = ("antenna_lever_arm", "gnss_latency", "gyro_scale_factor", "accel_scale_factor", "gyro_g_sensitivity")
 DECIDED_HERE = ("antenna_lever_arm", "gnss_latency", "gyro_g_sensitivity")  # never states of the null
-MARGIN = EFFECTS["gnss_latency"].largest["latency"]  # s at both ends, from which a latency could carry a fix out of the data
+MARGIN = EFFECTS["gnss_latency"].largest[
+    "latency"
+]  # s at both ends, from which a latency could carry a fix out of the data
 OPEN_POSITION, OPEN_VELOCITY = 30.0, 1.0  # m, m/s: the start's sigmas
 WIDER = 20.0  # times the declared sigmas of scale factors: the prior of the run that the start is taken from
 WIDE_ARM, WIDE_LATENCY = 1.0, 0.5  # m, s: the same
@@ -356,7 +358,7 @@ def _covariates(
     roll, pitch, yaw = dcm_to_rpy(dcm)
     rate, force = solution.gathered.measurements.rate[fixes], solution.gathered.measurements.force[fixes]
     turning = np.einsum("kij,kj->ki", dcm, rate)
-    acceleration = np.einsum("kij,kj->ki", dcm, force) + [0.0, 0.0, STANDARD_GRAVITY]
+    acceleration = np.einsum("kij,kj->ki", dcm, force) + np.array([0.0, 0.0, STANDARD_GRAVITY])
     common = {
         "time": time,
         "speed": np.hypot(velocity[:, 0], velocity[:, 1]),
