@@ -55,8 +55,9 @@ def _in_gap(time: Array, wanted: Array) -> NDArray[np.bool_]:
     return np.asarray(time[after] - time[after - 1] > DATA_GAP * np.median(np.diff(time)))
 
 
-def at_instants(time: Array, means: Array, wanted: Array) -> Array:
-    """Instantaneous values (m, 3) at `wanted` [s] (sorted) of what was recorded as means over the intervals that end at `time`.
+def at_instants(time: Array, means: Array, wanted: Array, derivative: int = 0) -> Array:
+    """Instantaneous values (m, 3) at `wanted` [s] (sorted), or their first `derivative`, of what was recorded as
+    means over the intervals that end at `time`.
 
     The derivative of a cubic spline through the running integral: at half the Nyquist frequency it is 5 % short, where
     interpolating the means is 36 % short, which would take a lever arm in a vibrating body for longer than it is.
@@ -72,7 +73,7 @@ def at_instants(time: Array, means: Array, wanted: Array) -> Array:
         increments = means[part][1:] * step[part.start : part.stop - 1, None]
         integral = np.concatenate([np.zeros((1, 3)), np.cumsum(increments, axis=0)])
         spline = CubicSpline(time[part], integral, axis=0)
-        out[chosen] = spline(np.clip(wanted[chosen], time[part][0], time[part][-1]), 1)
+        out[chosen] = spline(np.clip(wanted[chosen], time[part][0], time[part][-1]), 1 + derivative)
     return out
 
 

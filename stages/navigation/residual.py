@@ -34,7 +34,7 @@ from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu, ThermalCorrection
 from pipeline.residual_problem import Candidate, Parameter, Parameters, ResidualProblem
 from stages.navigation import kalman, states
-from stages.navigation.measurements import withheld
+from stages.navigation.measurements import Gathered, at_instants, withheld
 from stages.navigation.pos import declared, settled_start, smooth
 from stages.navigation.settings import NavigationSettings
 from stages.navigation.solve import Problem, Solution, forward
@@ -59,7 +59,8 @@ SIGMAS = 5.0  # of the declared scale factor's: a size worth naming
 MINUTE, SHORTEST, GROUPS = 60.0, 15.0, 8  # s, s: what is held out is a minute, or an eighth of a shorter flight
 FEWEST_FIXES = 20
 KEPT = 8  # linearisations in memory
-NEAR = 2.0  # steps of the differences: within them the derivatives serve
+EXACT = 1e-6  # relative, of a step
+PHASE = 5e-3  # s: within it a vibration of 25 Hz is a linear matter
 COMPONENTS = ("north", "east", "down", "north velocity", "east velocity", "down velocity")
 
 
@@ -76,7 +77,8 @@ class Linearisation:
 class Innovations:
     """Whitened innovations of the chosen fixes (k,) as a function of θ; passes are kept.
 
-    `steps` (13,): of the differences; within NEAR of them from a point where the filter was run, that run's derivatives serve.
+    `steps` (13,): of the differences; a point that is one of them off a point where the filter was run, in one parameter, is
+    answered by that run's derivatives.
     """
 
     null: Problem
@@ -88,20 +90,17 @@ class Innovations:
 
     def __call__(self, parameters: Parameters) -> Array:
         at = np.array([parameters.get(effect, {}).get(name, 0.0) for effect, name in self.order])
-        near = self._near(at)
-        return np.asarray(near.residual - near.signatures @ (at - near.theta))
-
-    def _near(self, at: Array) -> Linearisation:
-        distance = {key: float(np.max(np.abs(at - one.theta) / self.steps)) for key, one in self.kept.items()}
-        nearest = min(distance, key=lambda key: distance[key], default=None)
-        if nearest is not None and distance[nearest] <= NEAR:
-            self.kept.move_to_end(nearest)
-            return self.kept[nearest]
+        for key, one in reversed(self.kept.items()):
+            off = (at - one.theta) / self.steps
+            moved = off[off != 0.0]
+            if moved.size == 0 or (moved.size == 1 and abs(abs(moved[0]) - 1.0) < EXACT):
+                self.kept.move_to_end(key)
+                return np.asarray(one.residual - one.signatures @ (off * self.steps))
         made = self.at(at)
         self.kept[at.tobytes()] = made
         if len(self.kept) > KEPT:
             self.kept.popitem(last=False)
-        return made
+        return made.residual
 
     def at(self, at: Array) -> Linearisation:
         """The filter, run at θ."""
@@ -115,19 +114,64 @@ class Innovations:
         for column, (effect, name) in enumerate(self.order):
             place = states.GROUPS[effect].start + list(EFFECTS[effect].units).index(name)
             begun[np.searchsorted(active, place), column] = 1.0
-        carried = np.zeros((store.rows.size, 6, len(self.order)))
-        _carry(count, active, store, begun, carried)
         fixes = gathered.of_fix[self.chosen]
         m = int(gathered.measurements.size[fixes[0]])
         root = _roots(store.S_inv[fixes, :m, :m])
         y = np.einsum("kij,kj->ik", root, store.y[fixes, :m])
-        s = np.einsum("kij,kjq->ikq", root, carried[fixes, :m])
-        return Linearisation(at, y.ravel(), s.reshape(y.size, -1))
+
+        def signatures(jolts: Array) -> Array:
+            carried = np.zeros((store.rows.size, 6, len(self.order)))
+            _carry(count, active, store, begun.copy(), self._latency, jolts, carried)
+            return np.asarray(np.einsum("kij,kjq->ikq", root, carried[fixes, :m]).reshape(y.size, -1))
+
+        s = signatures(np.zeros((store.rows.size, 3)))
+        off, sigma = _beside_all(s, y.ravel(), self._latency)
+        if abs(off) + 2.0 * sigma < PHASE:
+            s = signatures(_jolts(problem, gathered, count, store))
+        return Linearisation(at, y.ravel(), s)
+
+    @property
+    def _latency(self) -> int:
+        return self.order.index(("gnss_latency", "latency"))
+
+
+def _beside_all(signatures: Array, residual: Array, column: int) -> tuple[float, float]:
+    """What the residual says of one parameter with all others estimated, and its sigma; (0, ∞) where it says nothing."""
+    size = np.linalg.norm(signatures, axis=0)
+    if not np.isfinite(residual).all() or not size[column] > 0.0:
+        return 0.0, float("inf")
+    seen = np.flatnonzero(size > 0.0)
+    scaled = signatures[:, seen] / size[seen]
+    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-10, hermitian=True)
+    at = int(np.searchsorted(seen, column))
+    return float(inverse[at] @ (scaled.T @ residual)) / size[column], float(np.sqrt(inverse[at, at])) / size[column]
+
+
+def _jolts(problem: Problem, gathered: Gathered, count: int, store: kalman.Store) -> Array:
+    """What the antenna's acceleration has beyond the unit's, C·(ω̇×l + ω×(ω×l)) (m, 3): vibration, mostly.
+
+    The filter's own derivative by the latency leaves it out, which is right over more than a fraction of the vibration's period:
+    there its phase is lost. Near the right latency it is what tells most.
+    """
+    epochs = np.flatnonzero(store.epoch_measurement[:count] >= 0)
+    at = store.epoch_measurement[epochs]
+    time = gathered.measurements.time[at]
+    rate = at_instants(problem.imu.time, problem.imu.gyro, time)
+    change = at_instants(problem.imu.time, problem.imu.gyro, time, derivative=1)
+    lever = problem.theta[states.parameter("antenna_lever_arm")]
+    arm = np.cross(change, lever) + np.cross(rate, np.cross(rate, lever))
+    out = np.zeros((store.rows.size, 3))
+    out[at] = np.einsum("kij,kj->ki", store.epoch_dcm[epochs], arm)
+    out[gathered.measurements.kind != kalman.FIX] = 0.0
+    return out
 
 
 @numba.njit(cache=True, nogil=True)
-def _carry(count, active, store, error, out):  # type: ignore[no-untyped-def]
-    """H·e⁻ (m, 6, q) at every measurement for errors (n, q) at the start, by the filter's own Φ, H and K; `error` is used up."""
+def _carry(count, active, store, error, latency, jolts, out):  # type: ignore[no-untyped-def]
+    """H·e⁻ (m, 6, q) at every measurement for errors (n, q) at the start, by the filter's own Φ, H and K; `error` is used up.
+
+    jolts (m, 3) [m/s²]: what H leaves out of the velocities' derivative by the latency, which is column `latency`.
+    """
     n = active.size
     for e in range(1, count):
         phi, decay = store.epoch_phi[e - 1], store.epoch_decay[e - 1]
@@ -141,6 +185,8 @@ def _carry(count, active, store, error, out):  # type: ignore[no-untyped-def]
         if at >= 0:
             m = store.rows[at]
             shown = np.ascontiguousarray(store.H[at, :m]) @ error
+            for i in range(m - 3):
+                shown[3 + i, latency] -= jolts[at, i]
             out[at, :m] = shown
             error -= np.ascontiguousarray(store.K[at, :, :m]) @ shown
 
@@ -312,7 +358,7 @@ def _covariates(
     roll, pitch, yaw = dcm_to_rpy(dcm)
     rate, force = solution.gathered.measurements.rate[fixes], solution.gathered.measurements.force[fixes]
     turning = np.einsum("kij,kj->ki", dcm, rate)
-    acceleration = np.einsum("kij,kj->ki", dcm, force) + [0.0, 0.0, STANDARD_GRAVITY]
+    acceleration = np.einsum("kij,kj->ki", dcm, force) + np.array([0.0, 0.0, STANDARD_GRAVITY])
     common = {
         "time": time,
         "speed": np.hypot(velocity[:, 0], velocity[:, 1]),
