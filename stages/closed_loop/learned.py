@@ -33,15 +33,22 @@ TABLE = 25
 
 
 def knots(covariate: Array, count: int) -> Array:
-    """Quantiles of the covariate, each once."""
-    return np.unique(np.quantile(covariate, np.linspace(0.0, 1.0, count + 1)))
+    """Quantiles of the covariate where it is known, each once."""
+    known = covariate[np.isfinite(covariate)]
+    return np.unique(np.quantile(known, np.linspace(0.0, 1.0, count + 1))) if known.size else known
 
 
 def spline_columns(covariate: Array, at: Array) -> Array:
     """Columns (n, k − 1) of a natural cubic spline on the knots `at` (k,) without the constant, each of unit RMS.
 
-    Beyond the knots it goes on as a straight line. Fewer than three knots: the line alone.
+    Beyond the knots it goes on as a straight line. Fewer than three knots: the line alone. Zero where the covariate is NaN.
     """
+    known = np.isfinite(covariate)
+    if not known.all():
+        part = spline_columns(covariate[known], at) if known.any() else np.zeros((0, 0))
+        columns = np.zeros((covariate.size, part.shape[1]))
+        columns[known] = part
+        return columns
     centre, spread = float(covariate.mean()), float(covariate.std())
     if spread == 0.0 or at.size < 2:
         return np.zeros((covariate.size, 0))
@@ -88,6 +95,8 @@ def ridge(m: Array, off: Sequence[int], columns: Sequence[int], target: int = -1
 
 def curve(covariate: Array, term: Array) -> dict[str, list[float]]:
     """The term (n,) on values of its covariate (n,): {"covariate": […], "value": […]}, ordered."""
+    known = np.isfinite(covariate)
+    covariate, term = covariate[known], term[known]
     order = np.argsort(covariate, kind="stable")
     x, y = covariate[order], term[order]
     at = np.unique(np.quantile(x, np.linspace(0.0, 1.0, TABLE)))

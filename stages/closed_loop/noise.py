@@ -90,7 +90,7 @@ class Channel:
         after = np.append(decay[1:], 0.0)
         diagonal = (1.0 / left + after**2 / np.append(left[1:], 1.0)) / rho
         beside = -(decay[1:] / left[1:]) / rho
-        d, e, bad = lapack.dpttrf(diagonal + 1.0, beside)
+        d, e, bad = (diagonal + 1.0, beside, 0) if beside.size == 0 else lapack.dpttrf(diagonal + 1.0, beside)
         if bad:
             raise FloatingPointError("the noise's covariance is not positive")
         log_det = float(np.log(d).sum() + np.log(left).sum() + left.size * np.log(rho))
