@@ -979,6 +979,25 @@ class CameraPoses:
 
 
 @dataclass(frozen=True)
+class ImageMotion:
+    """How the scene moved between pairs of frames, as images alone show it.
+
+    first, second (pair,): frame indices; pair (point,): the pair that a point belongs to; row, col (point,) [px]: where it was in
+    the first frame; row_shift, col_shift (point,) [px]: how far it moved to the second; sigma (pair,) [px]: scatter of points
+    about the pair's smooth motion. Pixels as measured, distortion and all.
+    """
+
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    pair: NDArray[np.int64]
+    row: Array
+    col: Array
+    row_shift: Array
+    col_shift: Array
+    sigma: Array
+
+
+@dataclass(frozen=True)
 class Products:
     """Spectra under the window, phase correction and spacing that were asked for (target, wavenumber); they are not scored.
 

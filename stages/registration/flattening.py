@@ -36,15 +36,23 @@ def flattened(frames: Frames, settings: RegistrationSettings) -> NDArray[np.uint
     profile = temporal_median(frames, settings.median_frames)
     with tempfile.TemporaryFile() as store:
         images = np.asarray(np.memmap(store, np.uint8, "w+", shape=(frames.time.size, *profile.shape)))
+    for start in range(0, len(images), BLOCK):
+        images[start : start + BLOCK] = texture(frames.block(start, start + BLOCK), profile, settings)
+    return images
+
+
+def texture(
+    counts: NDArray[np.uint16], profile: NDArray[np.float32], settings: RegistrationSettings
+) -> NDArray[np.uint8]:
+    """z of counts (frame, row, col) over their temporal median `profile` (row, col), in 8 bits."""
     side = (settings.contrast_px, settings.contrast_px)
     scale = np.float32((255 - MIDDLE) / RANGE)
-    for start in range(0, len(images), BLOCK):
-        block = frames.block(start, start + BLOCK)
-        for i, counts in enumerate(block, start):
-            texture = cv2.log(np.maximum(counts / profile, np.float32(DARKEST)))
-            texture -= cv2.blur(texture, side)
-            texture /= np.sqrt(cv2.blur(texture * texture, side)) + np.float32(settings.contrast_floor)
-            images[i] = np.clip(np.rint(texture * scale) + MIDDLE, 0, 255)
+    images = np.empty(counts.shape, np.uint8)
+    for image, frame in zip(images, counts, strict=True):
+        z = cv2.log(np.maximum(frame / profile, np.float32(DARKEST)))
+        z -= cv2.blur(z, side)
+        z /= np.sqrt(cv2.blur(z * z, side)) + np.float32(settings.contrast_floor)
+        image[:] = np.clip(np.rint(z * scale) + MIDDLE, 0, 255)
     return images
 
 

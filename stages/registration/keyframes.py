@@ -43,15 +43,15 @@ def follow(images: NDArray[np.uint8], step: Array, camera: Camera, settings: Reg
     serves until too few of its corners are followed; then the frame before takes its place, so that keys are few.
     """
     links: list[Link | None] = [None]
-    key, corners, last = 0, _corners(images[0], settings), np.eye(3)
+    key, corners, last = 0, corners_of(images[0], settings), np.eye(3)
     for i in range(1, len(images)):
         ahead = np.array([[1.0, 0.0, step[i, 0]], [0.0, 1.0, step[i, 1]], [0.0, 0.0, 1.0]])
-        link = _link(images, key, i, corners, ahead @ last, camera, settings)
+        link = link_of(images, key, i, corners, ahead @ last, camera, settings)
         if link is None and key != i - 1:
-            key, corners = i - 1, _corners(images[i - 1], settings)
-            link = _link(images, key, i, corners, ahead, camera, settings)
+            key, corners = i - 1, corners_of(images[i - 1], settings)
+            link = link_of(images, key, i, corners, ahead, camera, settings)
         if link is None:
-            key, corners, last = i, _corners(images[i], settings), np.eye(3)
+            key, corners, last = i, corners_of(images[i], settings), np.eye(3)
         else:
             last = link.similarity
         links.append(link)
@@ -74,14 +74,14 @@ def count_keys(links: list[Link | None]) -> int:
     return len(starts | {link.key for link in links if link is not None})
 
 
-def _corners(image: NDArray[np.uint8], settings: RegistrationSettings) -> Array:
+def corners_of(image: NDArray[np.uint8], settings: RegistrationSettings) -> Array:
     found = cv2.goodFeaturesToTrack(
         image, settings.corners, settings.corner_quality, settings.corner_distance_px, blockSize=5
     )
     return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(float)
 
 
-def _link(
+def link_of(
     images: NDArray[np.uint8],
     key: int,
     frame: int,

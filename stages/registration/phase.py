@@ -37,10 +37,10 @@ def phase_motion(images: NDArray[np.uint8], settings: RegistrationSettings) -> M
     offset, lost = np.zeros((count, 2)), np.zeros(count, bool)
     key, keys = 0, 1
     for i in range(1, count):
-        shift, response = _correlate(images[key], images[i], window)
+        shift, response = correlate(images[key], images[i], window)
         if key != i - 1 and not (response >= least and _overlap(shift, rows, cols) >= settings.phase_overlap):
             key, keys = i - 1, keys + 1
-            shift, response = _correlate(images[key], images[i], window)
+            shift, response = correlate(images[key], images[i], window)
         if response >= least:
             offset[i] = offset[key] + shift
         else:
@@ -51,7 +51,7 @@ def phase_motion(images: NDArray[np.uint8], settings: RegistrationSettings) -> M
     return Motion(matrix, np.tile(np.eye(3), (count, 1, 1)), lost, keys)
 
 
-def _correlate(key: NDArray[np.uint8], image: NDArray[np.uint8], window: NDArray[Any]) -> tuple[Array, float]:
+def correlate(key: NDArray[np.uint8], image: NDArray[np.uint8], window: NDArray[Any]) -> tuple[Array, float]:
     """Displacement (2,) [px] from key to image, and the response."""
     # phaseCorrelate overwrites its inputs at sizes that its transform likes: these are copies. The mean is taken off because it
     # alone would make two blank images agree.
