@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from pipeline.errors import InputError
 from pipeline.records import Gcps, ImageMotion, Targets, Temperatures, Trajectory
 from pipeline.residual_problem import Parameters
 from stages.tracking.collinearity import Condition, camera_poses, poses_at
@@ -55,9 +56,9 @@ class ResidualSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    motion_sigma_px: float = Field(0.02, gt=0, description="noise of a pair's motion, alike all over the image")
-    shape_sigma_px: float = Field(
-        0.01, gt=0, description="the same of what is not alike: slopes and curves over the image"
+    motion_sigma_px: float = Field(0.02, gt=0, description="noise of a pair's mean motion beside that of its points")
+    scatter_share: float = Field(
+        0.2, gt=0, description="noise of a pair's motion over the scatter of its points: neighbours err alike"
     )
     motion_bias_px: float = Field(0.005, ge=0, description="what registration is off by throughout a line")
     dem_datum_m: float = Field(0.05, ge=0, description="agreement of DEM and survey on what height is")
@@ -121,8 +122,15 @@ class LineRows:
     def __init__(self, line: Line, null: Geometry, dem: Terrain | None, settings: ResidualSettings) -> None:
         self.line, self.null, self.dem, self.settings = line, null, dem, settings
         motion, gcps = line.motion, line.gcps
+        if gcps is not None and (gcps.frame >= line.stamps.size).any():
+            raise InputError(
+                f"gcps of line {line.name}",
+                f"frame {int(gcps.frame.max())}",
+                f"does not exist: the line has {line.stamps.size} frames",
+                "give indices that count from 0",
+            )
         used = [np.zeros(0, int)]
-        used += [] if gcps is None else [gcps.frame[(gcps.frame >= 0) & (gcps.frame < line.stamps.size)]]
+        used += [] if gcps is None else [gcps.frame]
         used += [] if motion is None else [motion.first, motion.second]
         self.frames = np.unique(np.concatenate(used)).astype(int)
         self.at = lru_cache(maxsize=8)(self._at)
@@ -140,7 +148,8 @@ class LineRows:
         """The unit in the frames used, and what the mount is under there: both do not depend on anything but the latency."""
         line = self.line
         time = line.stamps[self.frames] - latency
-        asked = Mounting(np.zeros(3), drift=np.full(3, float(line.temperatures is not None)), flexure=np.ones(2))
+        drifts = line.temperatures is not None or bool(self.null.mounting.drift.any())
+        asked = Mounting(np.zeros(3), drift=np.full(3, float(drifts)), flexure=np.ones(2))
         return poses_at(line.trajectory, time), Condition.at(time, line.trajectory, asked, line.temperatures)
 
     def poses(self, geometry: Geometry, error: Offset | None = None) -> Poses:
@@ -161,7 +170,7 @@ class LineRows:
         if self.dem is None and not len(self.points):
             return None  # nothing tells how far the ground is
         places = np.searchsorted(self.frames, motion.first), np.searchsorted(self.frames, motion.second)
-        believed = self.settings.motion_sigma_px, self.settings.shape_sigma_px
+        believed = self.settings.motion_sigma_px, self.settings.scatter_share
         return modes_of(motion, places, known, self.poses(self.null), self.null.camera, self._ground, *believed)
 
     def _ground(self, latitude: Array, longitude: Array) -> Array:

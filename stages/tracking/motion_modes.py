@@ -123,11 +123,11 @@ def modes_of(
     camera: Camera,
     height: Height,
     mean_sigma: float,
-    shape_sigma: float,
+    scatter_share: float,
 ) -> Modes | None:
     """Of pairs between poses `known` (frame,); `places` (pair,): their frames among the poses; None where none is left.
 
-    mean_sigma, shape_sigma [px]: noise of the first mode and of the others beside that of the points.
+    mean_sigma [px]: noise that only the first mode has; scatter_share: noise of every mode over the scatter of its points.
     """
     good = (known[places[0]] & known[places[1]])[motion.pair]
     pair = motion.pair[good]
@@ -155,8 +155,8 @@ def modes_of(
         q = np.linalg.qr(columns)[0]
         q *= np.sign(np.einsum("ij,ij->j", q, columns))
         pairs.append((slice(size, size + labels.size), q.T * weight))
-        alike = np.where(np.arange(columns.shape[1]) == 0, mean_sigma, shape_sigma)
-        sigmas.append(np.hypot(motion.sigma[p] / np.sqrt(mine.size), alike))
+        own = max(scatter_share * motion.sigma[p], motion.sigma[p] / np.sqrt(mine.size))
+        sigmas.append(np.where(np.arange(columns.shape[1]) == 0, np.hypot(own, mean_sigma), own))
         cells.append(np.vstack([np.full(labels.size, p), mean]))
         size += labels.size
     if not pairs:

@@ -14,6 +14,7 @@ from simulated_lines import Flown, flown, settings_of
 
 from flows.settings import Settings
 from flows.steps import Plan, navigation_step
+from pipeline.errors import InputError
 from pipeline.raster import Dem
 from pipeline.records import Trajectory
 from pipeline.residual_problem import Basis, ResidualProblem
@@ -56,11 +57,11 @@ def problem_of(made: Flown, **changes: object) -> ResidualProblem:
 
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_an_effect_taken_into_the_model_leaves_nothing(effect: str) -> None:
-    """Simulated without noise and POS errors: with the true values what is left is 2 % of what is there without, and under a
+    """Simulated without noise and POS errors: with the true values what is left is 3 % of what is there without, and under a
     third of the noise. The rest is the terrain's curvature within the distance by which the effect moves a ray."""
     problem = problem_of(flown(two_lines(), 5, {effect: EFFECTS[effect]}, pos_errors=0.0, noise=0.0))
     without, within = problem.residual({}), problem.residual({effect: EFFECTS[effect]})
-    assert np.sqrt(np.mean(within**2)) < 0.02 * np.sqrt(np.mean(without**2))
+    assert np.sqrt(np.mean(within**2)) < 0.03 * np.sqrt(np.mean(without**2))
     assert np.sqrt(np.mean(within**2)) < 0.3
 
 
@@ -94,7 +95,7 @@ def test_clean_lines_are_white_and_named_nothing() -> None:
 
 
 def test_a_pos_error_within_its_sigma_is_no_boresight() -> None:
-    """Five sigma of everything that the POS may be off by stays under what a boresight of the same angle would show."""
+    """Twice what its sigmas say, in attitude, position and velocity at once."""
     wrong = flown(two_lines(), 9, {}, pos_errors=2.0)
     assert run(problem_of(wrong), LoopSettings(), 1).verdict == "no_effect"
 
@@ -149,6 +150,19 @@ def test_lines_with_nothing_to_compare_are_no_problem() -> None:
     assert tracking.residual_problem(bare, made.camera, made.mounting, made.dem) is None
     px = tracking.geometry_residual_px(bare, made.camera, made.mounting, made.dem, {})
     assert np.isnan(px).all()
+
+
+def test_mistakes_end_in_one_line() -> None:
+    made = flown(two_lines(), 13, {})
+    line = made.lines[0]
+    assert line.gcps is not None
+    late = replace(line, gcps=replace(line.gcps, frame=line.gcps.frame + 290))
+    with pytest.raises(InputError, match="the line has 300 frames"):
+        tracking.residual_problem([late], made.camera, made.mounting, made.dem)
+    drifts = {"boresight_thermal_drift": {"roll": 1e-5}}
+    with pytest.raises(InputError, match="boresight_thermal_drift"):
+        cold = replace(line, temperatures=None)
+        tracking.residual_problem([cold], made.camera, made.mounting, made.dem, effects=drifts)
 
 
 def test_a_pick_that_nothing_explains_is_left_out() -> None:
