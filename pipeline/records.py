@@ -983,8 +983,8 @@ class ImageMotion:
     """How the scene moved between pairs of frames, as images alone show it.
 
     first, second (pair,): frame indices; pair (point,): the pair that a point belongs to; row, col (point,) [px]: where it was in
-    the first frame; row_shift, col_shift (point,) [px]: how far it moved to the second; sigma (pair,) [px]: scatter of a point about
-    the pair's smooth motion. Pixels as measured, distortion and all.
+    the first frame; row_shift, col_shift (point,) [px]: how far it moved to the second; sigma (pair,) [px]: scatter of points
+    about the pair's smooth motion. Pixels as measured, distortion and all.
     """
 
     first: NDArray[np.int64]

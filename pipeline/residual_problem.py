@@ -9,6 +9,7 @@ Classes
 -------
 Parameter        one parameter of a candidate: its unit, what is believed of it, the step of its differences
 Candidate        an effect that the declared model may lack
+Basis            a covariate with curves of its own
 ResidualProblem  the residual with its nuisance, candidates, covariates, groups and noise blocks
 joined           several problems of one instrument as one
 """
@@ -67,6 +68,21 @@ class Candidate:
 
 
 @dataclass(frozen=True)
+class Basis:
+    """A covariate whose curves reach the samples in the stage's own way (as differences, in several channels of unlike noise).
+
+    columns (n, k): curves of the covariate as they show in the samples, the straight line first, none constant in the
+    covariate; values (n,): the covariate at each sample, NaN where it has none; at (m,) and curves, name → (m, k): what the
+    columns stand for, for a table.
+    """
+
+    columns: Array
+    values: Array
+    at: Array
+    curves: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
 class ResidualProblem:
     """A stage's residual (n,), ordered in series of growing time.
 
@@ -91,7 +107,7 @@ class ResidualProblem:
     time: Array
     nuisance: Array
     channel: Labels | None = None
-    covariates: Mapping[str, Array] = field(default_factory=dict)
+    covariates: Mapping[str, Array | Basis] = field(default_factory=dict)
     sigma: float | None = None
     floor: float = 0.0
     unit: str = "1"
@@ -104,8 +120,9 @@ class ResidualProblem:
             if value is not None and len(value) != n:
                 raise ValueError(f"{self.stage}: {name} has {len(value)} samples, group has {n}")
         for name, covariate in self.covariates.items():
-            if covariate.shape != (n,):
-                raise ValueError(f"{self.stage}: covariate {name} has shape {covariate.shape}, not ({n},)")
+            shape = covariate.values.shape if isinstance(covariate, Basis) else covariate.shape
+            if shape != (n,) or (isinstance(covariate, Basis) and len(covariate.columns) != n):
+                raise ValueError(f"{self.stage}: covariate {name} has shape {shape}, not ({n},)")
         same = np.diff(self.series) == 0
         if (np.diff(self.time)[same] <= 0).any():
             raise ValueError(f"{self.stage}: time does not grow within a series")

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from pipeline.residual_problem import Candidate, ResidualProblem
+from pipeline.residual_problem import Basis, Candidate, ResidualProblem
 from stages.closed_loop import confirmation, identifiability, learned
 from stages.closed_loop.confirmation import Confirmation, Model
 from stages.closed_loop.estimation import Estimate, estimate
@@ -316,8 +316,9 @@ def _varies_with(
     return worst
 
 
-def _centred(covariate: Array, rows: Index) -> Array:
+def _centred(covariate: Array | Basis, rows: Index) -> Array:
     """About its mean over `rows`; zero where it is not known."""
+    covariate = covariate.values if isinstance(covariate, Basis) else covariate
     used = covariate[rows]
     used = used[np.isfinite(used)]
     return np.where(np.isfinite(covariate), covariate - (used.mean() if used.size else 0.0), 0.0)
@@ -352,7 +353,10 @@ def _better_covariate(
 def _splines(problem: ResidualProblem, layout: Layout, count: int = 7) -> dict[str, Array]:
     out = {}
     for name, covariate in problem.covariates.items():
-        columns = learned.spline_columns(covariate, learned.knots(covariate[layout.rows], count))
+        if isinstance(covariate, Basis):
+            columns = covariate.columns
+        else:
+            columns = learned.spline_columns(covariate, learned.knots(covariate[layout.rows], count))
         if columns.shape[1]:
             out[name] = columns
     return out
@@ -450,7 +454,7 @@ def _learned_step(
                 checked.before,
                 checked.after,
                 finding.p,
-                table=learned.curve(problem.covariates[name], term),
+                table=_table(problem.covariates[name], term, beta[list(own)]),
             )
         )
         state.nuisance = np.column_stack([state.nuisance, spline])
@@ -460,6 +464,14 @@ def _learned_step(
     if finding.p < CERTAIN and _repeats(checked) and confirmation.controls_fail(reached, valid):
         state.certain.append(f"learned:{name}")
     return False
+
+
+def _table(covariate: Array | Basis, term: Array, beta: Array) -> dict[str, list[float]]:
+    """The learned curve on values of its covariate."""
+    if isinstance(covariate, Basis):
+        curves = {name: (curve @ beta).tolist() for name, curve in covariate.curves.items()}
+        return {"covariate": covariate.at.tolist(), **curves}
+    return learned.curve(covariate, term)
 
 
 def _close(

@@ -13,6 +13,9 @@ image_motion     pairs of frames over a line, and how their points moved
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +79,7 @@ def image_motion(
     )
 
 
-def _apart(image, count: int, window: Array, camera: Camera) -> int:  # type: ignore[no-untyped-def]
+def _apart(image: Callable[[int], NDArray[np.uint8]], count: int, window: NDArray[Any], camera: Camera) -> int:
     """Frames between the members of a pair."""
     probe = min(PROBE_FRAMES, count - 1)
     starts = np.unique(np.linspace(0, count - 1 - probe, PROBES).astype(int))

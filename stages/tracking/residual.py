@@ -2,14 +2,11 @@
 
     r = (1 + U·U')^(−1/2)·D⁻¹·(seen − predicted)
 
-Three kinds of rows: control points as picked minus the POS' prediction; motion between frames some way apart, as images show it
-(`stages.registration.image_motion`), minus that of the ground seen through both poses; surveyed heights minus the DEM's. D is
-the noise of each. U is what else the residual may hold with nothing missing: errors of the POS within its own sigmas, the same
-over a line or over a flight, and what registration and DEM are biased by (`stages.tracking.pos_errors`).
-
-The motion of a pair of frames comes as coefficients of a polynomial over the image, 1, y, x, x², xy, y², orthonormal over the
-points of the pair, for row and column: the noise of registration is alike all over a frame, and rows of single points would
-count it many times.
+Control points as picked minus the POS' prediction; motion between frames some way apart, as images show it
+(`stages.registration.image_motion`), minus that of the ground seen through both poses; surveyed heights minus the DEM's
+(`stages.tracking.line_rows`). D is the noise of each. U is what else the residual may hold with nothing missing: errors of the
+POS within its own sigmas, the same over a line or over a flight or wandering with the gyros' noise, and what registration and
+DEM are biased by (`stages.tracking.pos_errors`).
 
 Functions
 ---------
@@ -19,37 +16,28 @@ geometry_residual_px  RMS of the control points [px], held out from the estimate
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 
-from pipeline.raster import Dem
-from pipeline.records import Gcps, ImageMotion, Targets, Temperatures, Trajectory
-from pipeline.residual_problem import Candidate, Parameter, Parameters, ResidualProblem
-from stages.tracking.collinearity import Condition, camera_poses, poses_at
-from stages.tracking.pos_errors import Offsets, offsets, whitener
+from pipeline.residual_problem import Basis, Candidate, Parameter, Parameters, ResidualProblem
+from stages.tracking.curves import COVARIATES, Curves, Place, curves_of
+from stages.tracking.line_rows import SERIES, Geometry, Line, LineRows, ResidualSettings, Rows, Terrain, chosen
+from stages.tracking.pos_errors import whitener
 from tsmftis.camera import Camera, Mounting
-from tsmftis.effects import EFFECTS, Effects, amounts
-from tsmftis.geodesy import ecef_to_geodetic, geodetic_to_ecef, ned_to_ecef_dcm, radii_of_curvature
+from tsmftis.effects import EFFECTS, Effects
+from tsmftis.inertial import SensorModel
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-CELLS = (3, 5)  # of the detector, rows and columns: in each the points of a pair are averaged
-DEGREES = ((0, 0), (1, 0), (0, 1), (0, 2), (1, 1), (2, 0))  # of row and column in the modes of a motion
-OUTLIER = 4.0  # scatters of a pair beyond which a point is left out
-ROUNDS = 8  # of ray and terrain
-SLOPE_M = 10.0  # over which the terrain's slope is taken
-UNEVEN_M = 10.0  # relief of ground that no DEM tells of, where surveyed points do not say more
-LEAST_DEM_SIGMA_M = 0.02
-MOST_CONDITION = 30.0  # of a pair's modes: fewer are taken where the points do not carry them
-TIE_S = 1e-6
+HEIGHTS = 6  # channel
 GROSS = 6.0  # sigma of a pick that no effect accounts for, and that is taken for a mistake
 RATHER = 1.5  # sigma beyond which a pick counts less while mistakes are looked for
+MISTAKEN = 0.1  # of the picks, at most
+TIE_S = 1e-3  # least step of time where even the usual one is none
+LEAST_STEP = 0.25
 PLAUSIBLE: Mapping[str, float] = {
     "camera_latency": 2e-3,
     "boresight": 5e-4,
@@ -61,383 +49,6 @@ PLAUSIBLE: Mapping[str, float] = {
 CORNER_PX = 0.5  # by which a plausible distortion moves the corner of the image
 
 
-class ResidualSettings(BaseModel):
-    """What is believed of POS, registration and DEM before the data say more."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    motion_sigma_px: float = Field(0.02, gt=0, description="noise of a pair's motion, alike all over the image")
-    shape_sigma_px: float = Field(
-        0.01, gt=0, description="the same of what is not alike: slopes and curves over the image"
-    )
-    motion_bias_px: float = Field(0.005, ge=0, description="what registration is off by throughout a line")
-    dem_datum_m: float = Field(0.05, ge=0, description="agreement of DEM and survey on what height is")
-    least_sigma_position_m: float = Field(
-        0.01, ge=0, description="errors of the fixes that last for minutes, which no receiver's sigma holds"
-    )
-    sigma_attitude_deg: float = Field(0.01, gt=0, description="of roll, pitch and yaw where the POS states none")
-    sigma_position_m: float = Field(0.05, gt=0, description="where the POS states none")
-    sigma_velocity_m_per_s: float = Field(0.01, gt=0, description="where the POS states none")
-    least_groups: int = Field(6, ge=2, description="lines are cut into blocks of frames to give as many")
-
-
-@dataclass(frozen=True)
-class Line:
-    """What is known of a flight line. Lines of the same `flight` share errors of the POS; stamps (frame,) [s]."""
-
-    name: str
-    trajectory: Trajectory
-    stamps: Array
-    gcps: Gcps | None = None
-    targets: Targets | None = None
-    motion: ImageMotion | None = None
-    temperatures: Temperatures | None = None
-    flight: str = ""
-
-
-@dataclass(frozen=True)
-class Geometry:
-    """Camera and mounting with the effects of some values, and the height [m] that is added to the DEM."""
-
-    camera: Camera
-    mounting: Mounting
-    height: float
-
-    @classmethod
-    def of(cls, camera: Camera, mounting: Mounting, effects: Parameters) -> Geometry:
-        (height,) = amounts(effects, "dem_bias")
-        return cls(camera.with_effects(effects), mounting.with_effects(effects), height)
-
-    def plus(self, effects: Parameters) -> Geometry:
-        new = Geometry.of(self.camera, self.mounting, effects)
-        return replace(new, height=self.height + new.height)
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Rows (n,) of one kind in one line, in the order in which they are predicted.
-
-    frame: where in the line; series: rows that follow each other in time; `local` names covariates of these rows alone.
-    """
-
-    channel: Labels
-    series: Labels
-    frame: Array
-    sigma: Array
-    local: Mapping[str, Array] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Modes:
-    """Points of pairs (point,) averaged over cells, and how a pair's residuals make its modes.
-
-    first, second: place of the pair's frames among the frames used; ground (point, 3), normal and up (point, 3): where the first
-    frame's ray met the terrain; maps (pair) → (mode, point of the pair).
-    """
-
-    first: Labels
-    second: Labels
-    row: Array
-    col: Array
-    row_shift: Array
-    col_shift: Array
-    ground: Array
-    normal: Array
-    up: Array
-    pairs: tuple[tuple[slice, Array], ...]
-
-
-class _Line:
-    """A line's rows: predicted at any geometry. Poses are kept for the last latencies; all else is cheap."""
-
-    def __init__(self, line: Line, geometry: Geometry, dem: Dem | None, settings: ResidualSettings) -> None:
-        self.line, self.settings, self.dem, self.null_latency = line, settings, dem, geometry.camera.latency
-        motion, gcps = line.motion, line.gcps
-        used = [np.zeros(0, int)]
-        used += [] if gcps is None else [gcps.frame[(gcps.frame >= 0) & (gcps.frame < line.stamps.size)]]
-        used += [] if motion is None else [motion.first, motion.second]
-        self.frames = np.unique(np.concatenate(used)).astype(int)
-        self.at = lru_cache(maxsize=8)(self._at)
-        surveyed = [p for p in (gcps, line.targets) if p is not None]
-        places = [np.stack([p.latitude, p.longitude, p.height], -1) for p in surveyed]
-        self.points = np.unique(np.round(np.concatenate([np.zeros((0, 3)), *places]), 12), axis=0)
-        known = np.zeros(self.frames.size, bool)
-        if self.frames.size:
-            known = np.isfinite(self.at(geometry.camera.latency)[0].latitude)
-        self.picked = self._picked(known)
-        self.modes, self.motion_sigma = self._modes(geometry, known)
-        self.heights = self._heights(geometry)
-
-    def _at(self, latency: float) -> tuple[Trajectory, Condition]:
-        line = self.line
-        time = line.stamps[self.frames] - latency
-        everything = Mounting(np.zeros(3), drift=np.full(3, float(line.temperatures is not None)), flexure=np.ones(2))
-        return poses_at(line.trajectory, time), Condition.at(time, line.trajectory, everything, line.temperatures)
-
-    def poses(self, geometry: Geometry, error: Offsets | None = None) -> tuple[Array, Array]:
-        """Projection centre (frame, 3) and C_camera→ECEF (frame, 3, 3) of the frames used."""
-        if self.frames.size == 0:
-            return np.zeros((0, 3)), np.zeros((0, 3, 3))
-        events, under = self.at(geometry.camera.latency)
-        poses = camera_poses(events if error is None else error.applied(events), geometry.mounting, under)
-        return poses.centre, poses.dcm
-
-    def _picked(self, known: NDArray[np.bool_]) -> Gcps | None:
-        """Control points in frames of known pose, by frame."""
-        gcps = self.line.gcps
-        if gcps is None:
-            return None
-        order = np.argsort(gcps.frame, kind="stable")
-        order = order[np.isin(gcps.frame[order], self.frames[known])]
-        return self.only(gcps, order) if order.size else None
-
-    @staticmethod
-    def only(gcps: Gcps, index: Labels | NDArray[np.bool_]) -> Gcps:
-        return Gcps(**{name: getattr(gcps, name)[index] for name in Gcps.__dataclass_fields__})
-
-    def _modes(self, geometry: Geometry, known: NDArray[np.bool_]) -> tuple[Modes | None, tuple[Array, ...]]:
-        motion = self.line.motion
-        if motion is None or not self._has_ground:
-            return None, ()
-        camera = geometry.camera
-        place = {int(f): i for i, f in enumerate(self.frames)}
-        first, second = (np.array([place[int(f)] for f in v], int) for v in (motion.first, motion.second))
-        good = (known[first] & known[second])[motion.pair]
-        pair = motion.pair[good]
-        one = Modes(
-            first[pair],
-            second[pair],
-            *(v[good] for v in (motion.row, motion.col, motion.row_shift, motion.col_shift)),
-            *(np.zeros((0, 3)),) * 3,
-            (),
-        )
-        one = self._grounded(one, geometry)
-        row, col = self._moved(one, geometry, *self.poses(geometry))
-        sum_, pairs, cells = 0, [], []
-        sigmas: list[Array] = []
-        scale = np.array([camera.rows, camera.cols]) / 2.0
-        for p in np.unique(pair):
-            mine = np.flatnonzero(pair == p)
-            left = np.stack([row[mine], col[mine]], -1)
-            away = np.abs(left - np.median(left, axis=0))
-            scatter = np.maximum(1.4826 * np.median(away, axis=0), motion.sigma[p])
-            mine, left = (v[(away < OUTLIER * scatter).all(axis=1)] for v in (mine, left))
-            at = np.stack([one.row[mine], one.col[mine]], -1)
-            cell = np.minimum(at / (2.0 * scale) * CELLS, np.array(CELLS) - 1).astype(int) @ [CELLS[1], 1]
-            labels, index, size = np.unique(cell, return_inverse=True, return_counts=True)
-            if labels.size == 0:
-                continue
-            mean = np.stack([np.bincount(index, v) / size for v in (*at.T, *left.T)])
-            y, x = (mean[:2] - scale[:, None]) / scale[:, None]
-            columns = np.stack([y**a * x**b for a, b in DEGREES], -1) * np.sqrt(size / size.sum())[:, None]
-            columns = columns[:, : _full(columns)]
-            q = np.linalg.qr(columns)[0]
-            q *= np.sign(np.einsum("ij,ij->j", q, columns))
-            pairs.append((slice(sum_, sum_ + labels.size), q.T * np.sqrt(size / size.sum())))
-            alike = np.where(
-                np.arange(columns.shape[1]) == 0, self.settings.motion_sigma_px, self.settings.shape_sigma_px
-            )
-            sigmas.append(np.hypot(motion.sigma[p] / np.sqrt(size.sum()), alike))
-            cells.append(np.vstack([np.full(labels.size, p), mean]))
-            sum_ += labels.size
-        if not pairs:
-            return None, ()
-        table = np.concatenate(cells, axis=1)
-        p = table[0].astype(int)
-        zero = np.zeros(p.size)
-        made = Modes(first[p], second[p], table[1], table[2], zero, zero, *(np.zeros((0, 3)),) * 3, tuple(pairs))
-        made = self._grounded(made, geometry)
-        # What a cell's points have in common is what they miss on average; the cell's own shift is made to miss as much.
-        row, col = self._moved(made, geometry, *self.poses(geometry))
-        made = replace(made, row_shift=table[3] - row, col_shift=table[4] - col)
-        return made, tuple(sigmas)
-
-    @property
-    def _has_ground(self) -> bool:
-        return self.dem is not None or len(self.points) > 0
-
-    def ground_height(self, latitude: Array, longitude: Array) -> Array:
-        """The DEM's; without one, a level surface at the mean of the surveyed points."""
-        if self.dem is not None:
-            return self.dem.height(latitude, longitude)
-        return np.full(latitude.shape, float(self.points[:, 2].mean()))
-
-    def _grounded(self, modes: Modes, geometry: Geometry) -> Modes:
-        """Where the rays meet the terrain, and the terrain's normal there: a plane is near enough for any small change."""
-        centre, dcm = self.poses(geometry)
-        start = centre[modes.first]
-        ray = np.einsum("pij,pj->pi", dcm[modes.first], geometry.camera.directions(modes.row, modes.col))
-        latitude, longitude, height = ecef_to_geodetic(start)
-        sink = np.einsum("pi,pi->p", ray, ned_to_ecef_dcm(latitude, longitude)[:, :, 2])
-        along = (height - self.ground_height(latitude, longitude)) / sink
-        for _ in range(ROUNDS):
-            latitude, longitude, height = ecef_to_geodetic(start + along[:, None] * ray)
-            along = along + (height - self.ground_height(latitude, longitude) - geometry.height) / sink
-        ground = start + along[:, None] * ray
-        latitude, longitude, _ = ecef_to_geodetic(ground)
-        north, east = radii_of_curvature(latitude)
-        steps = SLOPE_M / north, SLOPE_M / (east * np.cos(latitude))
-        slope = [
-            (
-                self.ground_height(latitude + a * steps[0], longitude + b * steps[1])
-                - self.ground_height(latitude - a * steps[0], longitude - b * steps[1])
-            )
-            / (2.0 * SLOPE_M)
-            for a, b in ((1, 0), (0, 1))
-        ]
-        axes = ned_to_ecef_dcm(latitude, longitude)
-        normal = np.einsum("pij,pj->pi", axes, np.stack([-slope[0], -slope[1], -np.ones(latitude.size)], -1))
-        return replace(modes, ground=ground, normal=normal, up=-axes[:, :, 2])
-
-    def _moved(
-        self, modes: Modes, geometry: Geometry, centre: Array, dcm: Array, raised: float = 0.0
-    ) -> tuple[Array, Array]:
-        """Shift seen minus shift predicted (point,) of row and column, over ground that lies `raised` higher."""
-        ray = np.einsum("pij,pj->pi", dcm[modes.first], geometry.camera.directions(modes.row, modes.col))
-        start = centre[modes.first]
-        plane = modes.ground + raised * modes.up
-        along = np.einsum("pi,pi->p", modes.normal, plane - start) / np.einsum("pi,pi->p", modes.normal, ray)
-        point = start + along[:, None] * ray
-        sight = np.einsum("pij,pi->pj", dcm[modes.second], point - centre[modes.second])
-        row, col = geometry.camera.project(sight)
-        return modes.row + modes.row_shift - row, modes.col + modes.col_shift - col
-
-    def _heights(self, geometry: Geometry) -> tuple[Array, Array]:
-        """Surveyed minus DEM's heights (point,) and the frame that is nearest to each, in that order."""
-        if self.dem is None or not len(self.points):
-            return np.zeros(0), np.zeros(0)
-        covered = self.dem.covers(self.points[:, 0], self.points[:, 1])
-        points = self.points[covered]
-        if not len(points):
-            return np.zeros(0), np.zeros(0)
-        every = np.unique(np.linspace(0, self.line.stamps.size - 1, 50).astype(int))
-        path = poses_at(self.line.trajectory, self.line.stamps[every] - geometry.camera.latency)
-        known = np.isfinite(path.latitude)
-        if not known.any():
-            return np.zeros(0), np.zeros(0)
-        unit = geodetic_to_ecef(path.latitude[known], path.longitude[known], path.height[known])
-        away = np.linalg.norm(geodetic_to_ecef(*points.T)[:, None] - unit, axis=-1)
-        frame = every[known][np.argmin(away, axis=1)]
-        order = np.argsort(frame, kind="stable")
-        left = points[:, 2] - self.dem.height(points[:, 0], points[:, 1])
-        return left[order], frame[order].astype(float)
-
-    def picks(self, geometry: Geometry, centre: Array, dcm: Array) -> Array:
-        """Picked minus predicted [px] (pick, 2)."""
-        gcps = self.picked
-        if gcps is None:
-            return np.zeros((0, 2))
-        at = np.searchsorted(self.frames, gcps.frame)
-        point = geodetic_to_ecef(gcps.latitude, gcps.longitude, gcps.height)
-        row, col = geometry.camera.project(np.einsum("gij,gi->gj", dcm[at], point - centre[at]))
-        return np.stack([gcps.row - row, gcps.col - col], -1)
-
-    def residual(self, geometry: Geometry, null: Geometry, error: Offsets | None = None, raised: float = 0.0) -> Array:
-        """Seen minus predicted (n,), in pixels and metres: picks' rows, columns; pairs' modes of rows, columns; heights."""
-        centre, dcm = self.poses(geometry, error)
-        picks = self.picks(geometry, centre, dcm)
-        parts = [picks[:, 0], picks[:, 1]]
-        if self.modes is not None:
-            row, col = self._moved(self.modes, geometry, centre, dcm, geometry.height - null.height + raised)
-            for left in (row, col):
-                parts += [maps @ left[mine] for mine, maps in self.modes.pairs]
-        return np.concatenate([*parts, self.heights[0] - geometry.height])
-
-    def rows(self) -> list[Rows]:
-        """In the order of `residual`; channels: 0, 1 picks; 2, 3 mean motion, 4 its slopes, 5 its curves; 6 heights."""
-        out = []
-        if self.picked is not None:
-            frame = self.picked.frame.astype(float)
-            for axis in (0, 1):
-                out.append(self._rows(axis, frame, self.picked.sigma, axis, self._covariates(axis)))
-        if self.modes is not None:
-            motion = self.line.motion
-            assert motion is not None
-            for axis in (0, 1):
-                for sigma, (mine, maps) in zip(self.motion_sigma, self.modes.pairs, strict=True):
-                    frames = self.frames[[self.modes.first[mine][0], self.modes.second[mine][0]]]
-                    k = len(maps)
-                    mode = np.arange(k)
-                    channel = np.select([mode == 0, mode < 3], [2 + axis, 4], 5)
-                    series = 2 + axis * len(DEGREES) + mode
-                    out.append(Rows(channel, series, np.full(k, frames.mean()), sigma))
-        left, frame = self.heights
-        if left.size:
-            sigma = max(1.4826 * float(np.median(np.abs(left - np.median(left)))), LEAST_DEM_SIGMA_M)
-            out.append(self._rows(6, frame, np.full(left.size, sigma), 2 + 2 * len(DEGREES), {}))
-        return out
-
-    def _rows(self, channel: int, frame: Array, sigma: Array, series: int, local: Mapping[str, Array]) -> Rows:
-        n = frame.size
-        return Rows(np.full(n, channel), np.full(n, series), frame, sigma, local)
-
-    def _covariates(self, axis: int) -> dict[str, Array]:
-        """Of the picks' rows (axis 0: across track) or columns (1: along track)."""
-        assert self.picked is not None
-        events, under = self.at(self.null_latency)
-        at = np.searchsorted(self.frames, self.picked.frame)
-        angle, where = ("roll", "across track") if axis == 0 else ("pitch", "along track")
-        assert under.acceleration is not None
-        out = {
-            f"time {where}": events.time[at],
-            f"row {where}": self.picked.row,
-            f"column {where}": self.picked.col,
-            angle: events.rpy[at, axis],
-            f"{angle} rate": events.rate[at, axis],
-            f"{angle} acceleration": under.acceleration[at, axis],
-            f"ground height {where}": self.picked.height,
-        }
-        if under.temperature is not None:
-            out[f"temperature {where}"] = under.temperature[at]
-        if axis == 1:
-            out["ground speed"] = np.hypot(events.velocity[at, 0], events.velocity[at, 1])
-        return out
-
-    def seconds(self, frame: Array) -> Array:
-        """Stamp of frames, also of those half way between."""
-        return np.interp(frame, np.arange(self.line.stamps.size), self.line.stamps)
-
-    def pos_columns(self, geometry: Geometry) -> Array:
-        """What one standard deviation of each constant error of the POS does to the residual (n, 9)."""
-        null = self.residual(geometry, geometry)
-        if self.frames.size == 0:
-            return np.zeros((null.size, 9))
-        believed, events = self.settings, self.at(geometry.camera.latency)[0]
-        stated = {
-            "sigma_attitude": (np.deg2rad(believed.sigma_attitude_deg), 0.0),
-            "sigma_position": (believed.sigma_position_m, believed.least_sigma_position_m),
-            "sigma_velocity": (believed.sigma_velocity_m_per_s, 0.0),
-        }
-        sizes = []
-        for name, (unknown, least) in stated.items():
-            values = getattr(events, name)
-            values = values[np.isfinite(values).all(axis=1)]
-            sizes.append(np.maximum(values.mean(axis=0) if len(values) else np.full(3, unknown), least))
-        return np.stack([self.residual(geometry, geometry, error) - null for error in offsets(*sizes)], -1)
-
-    def other_columns(self, geometry: Geometry, rows: Sequence[Rows]) -> Array:
-        """The same of registration's own bias, mode by mode, and of the ground's height where no DEM tells it."""
-        if self.modes is None:
-            return np.zeros((sum(r.frame.size for r in rows), 0))
-        channel, series, frame = (np.concatenate([getattr(r, n) for r in rows]) for n in ("channel", "series", "frame"))
-        moving = (channel >= 2) & (channel <= 5)
-        columns = [self.settings.motion_bias_px * (moving & (series == one)) for one in np.unique(series[moving])]
-        if self.dem is None:
-            relief = max(float(np.std(self.points[:, 2])), UNEVEN_M)
-            raised = self.residual(geometry, geometry, raised=relief) - self.residual(geometry, geometry)
-            columns += [raised, *(raised * (frame == one) for one in np.unique(frame[moving]))]
-        return np.stack(columns, -1).astype(float)
-
-
-def _full(columns: Array) -> int:
-    """How many of the first columns are safely independent."""
-    for count in (columns.shape[1], 3, 1):
-        part = columns[:, :count]
-        if count == 1 or (len(part) >= count and np.linalg.cond(part) < MOST_CONDITION):
-            return count
-    return 1
-
-
 class _Campaign:
     """All lines, their rows in series of growing time, whitened."""
 
@@ -446,13 +57,14 @@ class _Campaign:
         lines: Sequence[Line],
         camera: Camera,
         mounting: Mounting,
-        dem: Dem | None,
+        dem: Terrain | None,
         settings: ResidualSettings,
         effects: Effects,
+        gyro: SensorModel | None,
     ) -> None:
         own = {name: values for name, values in effects.items() if EFFECTS[name].stage == "geometry"}
-        self.null, self.dem = Geometry.of(camera, mounting, own), dem
-        self.lines = [_Line(line, self.null, dem, settings) for line in lines]
+        self.null, self.dem, self.gyro = Geometry.of(camera, mounting, own), dem, gyro
+        self.lines = [LineRows(line, self.null, dem, settings) for line in lines]
         self._lay_out(settings)
         if self.mistaken():
             self._lay_out(settings)
@@ -477,40 +89,30 @@ class _Campaign:
         frames = np.array([line.line.stamps.size for line in self.lines])[self.line]
         self.blocks = blocks
         self.group = self.line * blocks + np.minimum((frame / frames * blocks).astype(int), blocks - 1)
-        self.series = self.line * 100 + series
+        self.series = self.line * SERIES + series
         self.time = _growing(time[self.order], self.series[self.order])
         u = self._shared(rows, n, settings) / sigma[:, None]
         self.whiten = whitener(u)
-        self.covariates = {}
-        place = 0
-        for r in flat:
-            for name, values in r.local.items():
-                self.covariates.setdefault(name, np.full(n, np.nan))[place : place + values.size] = values
-            place += r.frame.size
 
     def _shared(self, rows: Sequence[Sequence[Rows]], n: int, settings: ResidualSettings) -> Array:
         """Columns (n, m), in the residual's own units, of what many rows share."""
-        flights: dict[str, list[Array]] = {}
+        flights: dict[str, Array] = {}
         columns = []
         for i, (line, own) in enumerate(zip(self.lines, rows, strict=True)):
-            mine = self.line == i
-            if not own:
+            mine = np.flatnonzero(self.line == i)
+            if not mine.size:
                 continue
-            pos = np.zeros((n, 9))
-            pos[mine] = line.pos_columns(self.null)
-            other = line.other_columns(self.null, own)
-            wide = np.zeros((n, other.shape[1]))
-            wide[mine] = other
-            flights.setdefault(line.line.flight, []).append(pos)
-            columns += [pos, wide]
-        columns += [np.sum(same, axis=0) for same in flights.values() if len(same) > 1]
-        columns.append(settings.dem_datum_m * (self.channel == 6).astype(float)[:, None])
-        return np.concatenate(columns, axis=1)
+            for_line, common = line.own(own, self.gyro), line.common(self.gyro)
+            columns.append(np.zeros((n, for_line.shape[1])))
+            columns[-1][mine] = for_line
+            flights.setdefault(line.line.flight, np.zeros((n, common.shape[1])))[mine] = common
+        datum = settings.dem_datum_m * (self.channel == HEIGHTS).astype(float)[:, None]
+        return np.concatenate([*columns, *flights.values(), datum], axis=1)
 
     def raw(self, effects: Parameters) -> Array:
         """Over each row's sigma (n,), lines one after the other."""
         geometry = self.null.plus(effects)
-        return np.concatenate([line.residual(geometry, self.null) for line in self.lines]) / self.sigma
+        return np.concatenate([line.residual(geometry) for line in self.lines]) / self.sigma
 
     def residual(self, effects: Parameters) -> Array:
         return np.asarray(self.whiten(self.raw(effects))[self.order])
@@ -518,7 +120,7 @@ class _Campaign:
     def picks(self, effects: Parameters) -> Array:
         """[px] (pick, 2), in the order of the rows of the channels 0 and 1."""
         geometry = self.null.plus(effects)
-        return np.concatenate([line.picks(geometry, *line.poses(geometry)) for line in self.lines])
+        return np.concatenate([line.picks(geometry) for line in self.lines])
 
     def candidates(self) -> tuple[Candidate, ...]:
         names = [name for name, effect in EFFECTS.items() if effect.stage == "geometry"]
@@ -542,6 +144,73 @@ class _Campaign:
             )
             for name in names
         )
+
+    def covariates(self) -> dict[str, Basis]:
+        """Displacements in row and column as curves of time, place in the image, attitude and its rates, temperature, speed."""
+        places = [line.places() for line in self.lines]
+        every = [p for one in places for p in one]
+        if not every:
+            return {}
+        camera = self.null.camera
+
+        def radial(p: Place) -> Array:
+            away = np.stack([p.row - camera.principal_row, p.col - camera.principal_col], -1)
+            return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+
+        def radius(p: Place) -> Array:
+            return np.hypot(p.row - camera.principal_row, p.col - camera.principal_col)
+
+        out = {}
+        for name, of in COVARIATES.items():
+            curve_of = [curves_of(np.concatenate([of(p)[:, axis] for p in every])) for axis in (0, 1)]
+            if any(c is None for c in curve_of):
+                continue
+            out[name] = self._basis(places, of, curve_of, None)
+        ring = curves_of(np.concatenate([radius(p) for p in every]))
+        if ring is not None:
+            out["image radius"] = self._basis(places, lambda p: np.stack([radius(p)] * 2, -1), [ring], radial)
+        return out
+
+    def _basis(
+        self,
+        places: Sequence[Sequence[Place]],
+        of: Callable[[Place], Array],
+        curves: Sequence[Curves | None],
+        along: Callable[[Place], Array] | None,
+    ) -> Basis:
+        """Curves of a covariate (place, 2), for row and column each or for the direction `along`, in the samples."""
+        known = [c for c in curves if c is not None]
+        k = known[0].count
+
+        def move(p: Place) -> Array:
+            x = of(p)
+            if along is not None:
+                return np.asarray(along(p)[:, :, None] * known[0](x[:, 0])[:, None, :])
+            out = np.zeros((len(x), 2, 2 * k))
+            for axis in (0, 1):
+                out[:, axis, axis * k : (axis + 1) * k] = known[axis](x[:, axis])
+            return out
+
+        columns = np.concatenate(
+            [line.spread([move(p) for p in one]) for line, one in zip(self.lines, places, strict=True)]
+        )
+        columns = np.asarray(self.whiten(columns / self.sigma[:, None])[self.order])
+        scale = np.sqrt(np.mean(columns**2, axis=0))
+        scale[scale == 0.0] = 1.0
+        values = np.full(self.count, np.nan)
+        for i, one in enumerate(places):
+            if self.lines[i].picked is not None:
+                mine = np.flatnonzero((self.line == i) & (self.channel < 2))
+                values[mine] = of(one[0]).T.ravel()
+        at = known[0].table if along is not None or len(known) == 1 else np.union1d(known[0].table, known[1].table)
+        if along is not None:
+            table = {"radial_px": known[0](at) / scale}
+        else:
+            wide = [np.zeros((at.size, 2 * k)) for _ in (0, 1)]
+            for axis in (0, 1):
+                wide[axis][:, axis * k : (axis + 1) * k] = known[axis](at)
+            table = {name: w / scale for name, w in zip(("row_px", "column_px"), wide, strict=True)}
+        return Basis(columns / scale, values[self.order], at, table)
 
     def signatures(self, at: Parameters, of: Sequence[tuple[str, str, float]], whitened: bool = True) -> Array:
         """∂prediction/∂parameter (n, k) by differences of the given steps."""
@@ -585,11 +254,11 @@ class _Campaign:
         bad[np.flatnonzero(pick)[np.abs(left) > GROSS * scale]] = True
         found = [bad[(self.line == i) & pick].reshape(2, -1).any(axis=0) for i in range(len(self.lines))]
         number, all_picks = sum(int(f.sum()) for f in found), sum(f.size for f in found)
-        if number == 0 or number > 0.1 * all_picks:
+        if number == 0 or number > MISTAKEN * all_picks:
             return False
         for line, f in zip(self.lines, found, strict=True):
             if line.picked is not None and f.any():
-                line.picked = line.only(line.picked, ~f) if not f.all() else None
+                line.picked = chosen(line.picked, ~f) if not f.all() else None
         return True
 
 
@@ -599,11 +268,14 @@ def _moved(values: Parameters, effect: str, key: str, change: float) -> Paramete
 
 
 def _growing(time: Array, series: Labels) -> Array:
-    """Time with ties inside a series parted, by what no noise notices."""
+    """Time with no step inside a series under a quarter of the usual one: of two picks in one frame coloured noise without
+    a white part would say that they err alike, to the last digit."""
+    same = np.diff(series) == 0
+    steps = np.where(same, np.diff(time), np.nan)
     out = time.copy()
-    for i in range(1, out.size):
-        if series[i] == series[i - 1] and out[i] <= out[i - 1]:
-            out[i] = out[i - 1] + TIE_S
+    least = {one: LEAST_STEP * float(np.nanmedian(steps[series[1:] == one])) for one in np.unique(series[1:][same])}
+    for i in np.flatnonzero(same) + 1:
+        out[i] = max(out[i], out[i - 1] + max(least[series[i]], TIE_S))
     return out
 
 
@@ -611,15 +283,16 @@ def residual_problem(
     lines: Sequence[Line],
     camera: Camera,
     mounting: Mounting,
-    dem: Dem | None,
+    dem: Terrain | None,
     settings: ResidualSettings | None = None,
     effects: Effects | None = None,
+    gyro: SensorModel | None = None,
 ) -> ResidualProblem | None:
     """The problem of all lines together, or None where no line has a control point, a motion or a surveyed height on the DEM.
 
     `effects` are those that models have by now; those of other stages change nothing here.
     """
-    made = _Campaign(lines, camera, mounting, dem, settings or ResidualSettings(), effects or {})
+    made = _Campaign(lines, camera, mounting, dem, settings or ResidualSettings(), effects or {}, gyro)
     if made.count == 0:
         return None
     order, blocks = made.order, made.blocks
@@ -637,7 +310,8 @@ def residual_problem(
         time=made.time,
         nuisance=np.zeros((order.size, 0)),
         channel=made.channel[order],
-        covariates={name: values[order] for name, values in made.covariates.items() if np.nanstd(values) > 0.0},
+        covariates=made.covariates(),
+        sigma=1.0,
         unit="sigma",
         group_names=names,
     )
@@ -647,17 +321,18 @@ def geometry_residual_px(
     lines: Sequence[Line],
     camera: Camera,
     mounting: Mounting,
-    dem: Dem | None,
+    dem: Terrain | None,
     found: Parameters,
     settings: ResidualSettings | None = None,
     effects: Effects | None = None,
+    gyro: SensorModel | None = None,
 ) -> tuple[float, float]:
     """RMS of control points [px], per coordinate, without `found` and with; NaN where there are none.
 
     With: each group is predicted by the effects' values as all other groups give them (one Gauss–Newton step from `found`, which
     has seen all), so that no point is held against a fit of its own.
     """
-    made = _Campaign(lines, camera, mounting, dem, settings or ResidualSettings(), effects or {})
+    made = _Campaign(lines, camera, mounting, dem, settings or ResidualSettings(), effects or {}, gyro)
     if made.count == 0 or not (made.channel < 2).any():
         return float("nan"), float("nan")
     before = float(np.sqrt(np.mean(made.picks({}) ** 2)))

@@ -14,7 +14,7 @@ from scipy.stats import binom
 from pipeline.errors import InputError
 from pipeline.formats.opus import read_opus
 from pipeline.records import Bench
-from pipeline.residual_problem import Candidate, Parameter, Parameters, ResidualProblem
+from pipeline.residual_problem import Basis, Candidate, Parameter, Parameters, ResidualProblem
 from stages.bench import BenchSettings, residual_problem
 from stages.bench import run as bench_stage
 from stages.closed_loop import LoopSettings, run
@@ -212,6 +212,34 @@ def test_a_name_whose_size_changes_is_refused() -> None:
     result = run(made_up.problem(world, truth, k, 600, without=["scale"]), QUICK, 1)
     assert "tilt" not in [s.effect for s in result.steps] and result.verdict != "no_effect"
     assert any("size changes with speed" in note for note in result.notes)
+
+
+def test_a_covariate_that_reaches_some_samples_or_brings_its_own_curves() -> None:
+    """NaN: not this sample. A basis is taken as it is, its table by its own curves."""
+    rng = np.random.default_rng(8)
+    x = rng.uniform(-1.0, 1.0, 360)
+    half = np.arange(360) % 2 == 0
+    y = rng.standard_normal(360) + np.where(half, 2.0 * x, 0.0)
+    partly = np.where(half, x, np.nan)
+    columns = spline_columns(partly, knots(partly, 7))
+    assert not columns[~half].any()
+    np.testing.assert_array_equal(columns[half], spline_columns(x[half], knots(x[half], 7)))
+    at = np.linspace(-1.0, 1.0, 5)
+    own = Basis(np.where(half, x, 0.0)[:, None], partly, at, {"px": at[:, None]})
+    other = rng.standard_normal(360)
+    for covariate, name in ((partly, "value"), (own, "px")):
+        result = run(simple(y, {"a": other}, covariates={"x": covariate, "other": other}), QUICK, 1)
+        (step,) = result.steps
+        assert step.effect == "learned:x" and step.table is not None
+        slope = np.polyfit(step.table["covariate"], step.table[name], 1)[0]
+        assert abs(slope - 2.0) < 0.5
+
+
+def test_a_channel_of_a_single_sample_has_a_likelihood() -> None:
+    problem = simple(np.random.default_rng(1).standard_normal(12), {}, channel=np.append(np.zeros(11, int), 1))
+    layout = Layout.of(problem, np.arange(12))
+    noise = (Colour(1.0, 1e-3, 5.0, 9.0), Colour(4.0, 1e-9, 5.0, 0.0))
+    assert gram(layout, noise, np.ones((12, 1)))[0, 0] > 0.25 and np.isfinite(log_det(layout, noise))
 
 
 def test_neither_name_nor_covariate_ends_unexplained() -> None:

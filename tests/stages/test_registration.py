@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.spatial.transform import Rotation
 
 from pipeline.records import CameraPoses, Frames, Tracks
-from stages.registration import RegistrationSettings, run
+from stages.registration import RegistrationSettings, image_motion, run
 from tsmftis.camera import Camera
 
 ROWS, COLS, FRAMES = 96, 192, 90
@@ -250,3 +250,26 @@ def test_the_same_frames_give_the_same_tracks_on_any_number_of_threads() -> None
         cv2.setNumThreads(before)
     for name in ("row", "col"):
         assert getattr(results[0], name).tobytes() == getattr(results[1], name).tobytes()
+
+
+def test_motion_of_pairs_is_that_of_the_ground() -> None:
+    """Mean over a pair within .05 px of the truth, points clear of the edge, under fixed fringes and distortion."""
+    flight = Flight(k1=K1)
+    found = image_motion(frames(flight), flight.camera, RegistrationSettings())
+    assert found.first.size >= 5 and np.unique(found.second - found.first).size == 1
+    assert (np.diff(found.pair) >= 0).all() and found.sigma.max() < 0.15
+    for i, (first, second) in enumerate(zip(found.first, found.second, strict=True)):
+        mine = found.pair == i
+        row, col = found.row[mine], found.col[mine]
+        assert row.min() >= 15 and col.min() >= 15 and row.max() <= ROWS - 16 and col.max() <= COLS - 16
+        where = [np.rint(v).astype(int) for v in (row, col)]
+        north, east = (g[where[0], where[1]] for g in flight.meets(float(first)))
+        begun = np.stack(flight.project(north, east, float(first)))
+        moved = np.stack(flight.project(north, east, float(second))) - begun
+        seen = np.stack([found.row_shift[mine], found.col_shift[mine]])
+        np.testing.assert_allclose(np.mean(seen - moved, axis=1), 0.0, atol=0.05)
+
+
+def test_frames_without_texture_have_no_motion() -> None:
+    found = image_motion(frames(Flight(), (0, FRAMES)), Flight().camera, RegistrationSettings())
+    assert found.first.size == 0 and found.pair.size == 0
