@@ -2,11 +2,11 @@
 
     y = F·β + H·γ + f(x) + e,     f ~ GP(0, s²·σ²·exp(−½ Σ_d ((x_d − x'_d)/ℓ_d)²)),     e ~ σ²·(I + c²·exp(−|Δt|/τ) within a run)
 
-F holds a level for each run and a straight line in each feature, H what a memory of temperature could add. ℓ, s, c, τ, σ are those
-of the largest evidence with β and γ integrated out (flat priors, so this is restricted likelihood [1]_) times weak log-normal
-priors. H matters: without it widths shrink until f imitates the memory that is to be looked for, and the looking finds nothing;
-with it f has the widths that the rest of the data ask for. Of the kernel, freed of F, the directions v_k count that the prior lets
-rise above the noise of a block, λ_k > KEPT·σ².
+F holds a level for each run and a straight line in each feature, H what a memory of temperature could add. ℓ, s, c, τ, σ are
+those of the largest evidence with β and γ integrated out (flat priors, so this is restricted likelihood [1]_) times weak
+log-normal priors. H matters: without it widths shrink until f imitates the memory that is to be looked for, and the looking
+finds nothing; with it f has the widths that the rest of the data ask for. Of the kernel, freed of F, the directions v_k
+count that the prior lets rise above the noise of a block, λ_k > KEPT·σ².
 
 Classes and functions
 ---------------------
@@ -34,7 +34,7 @@ from stages.thermal.network import one_thread
 
 Array = NDArray[np.float64]
 
-KEPT = 0.3  # of a block's noise variance
+KEPT = 0.1  # of a block's noise variance: plays on 8 clean units then have an RMS of 1.0 sigma, 1.15 at 0.3
 LOG_WIDTH_MEAN, LOG_WIDTH_SIGMA = np.log(3.0), 1.0  # in standard deviations of the feature
 LOG_SIZE_MEAN, LOG_SIZE_SIGMA = 2.0, 3.0  # of f over the noise of a block
 LOG_COLOUR_MEAN, LOG_COLOUR_SIGMA = -2.0, 2.0  # of the coloured noise over the white one
