@@ -54,13 +54,13 @@ def estimate(
 ) -> Estimate:
     """From `values` to the minimum over all their parameters; `nuisance` (n, p) over all samples, of which layout.rows count.
 
-    A parameter on its physical bound stays there and is named in `at_bound`.
+    A parameter on its physical bound stays there and is named in `at_bound`; one that `values` does not name stays at zero.
     """
-    order = tuple((effect, name) for effect in values for name in candidates[effect].parameters)
+    order = tuple((e, name) for e in values for name in _named(values, candidates[e]))
     rows, p = layout.rows, nuisance.shape[1]
     low = np.array([candidates[e].parameters[n].low for e, n in order])
     high = np.array([candidates[e].parameters[n].largest for e, n in order])
-    at = np.clip([values[e].get(n, 0.0) for e, n in order], low, high)
+    at = np.clip([values[e][n] for e, n in order], low, high)
     own = list(range(p, p + len(order)))
 
     def packed(vector: Array) -> Values:
@@ -112,8 +112,12 @@ def estimate(
 
 def _signatures(problem: ResidualProblem, values: Values, candidates: Mapping[str, Candidate]) -> Array:
     return np.column_stack(
-        [derivatives(problem, values, candidates[e], tuple(candidates[e].parameters)) for e in values]
+        [derivatives(problem, values, candidates[e], _named(values, candidates[e])) for e in values]
     )
+
+
+def _named(values: Values, candidate: Candidate) -> tuple[str, ...]:
+    return tuple(name for name in candidate.parameters if name in values[candidate.effect])
 
 
 def _bounded_step(m: Array, own: Sequence[int], at: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:

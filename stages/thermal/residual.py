@@ -16,7 +16,7 @@ residual_problem    of chamber runs
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -28,10 +28,11 @@ from pipeline.residual_problem import Candidate, Parameter, Parameters, Residual
 from stages.thermal import memory as history
 from stages.thermal import smooth
 from stages.thermal.binning import block_means
+from stages.thermal.branches import branches, held_out, pieces
 from stages.thermal.features import NAMES, STEPS_PER_TIME_CONSTANT, smoothed
 from stages.thermal.memory import Memory
 from stages.thermal.settings import ThermalSettings
-from stages.thermal.smooth import Smooth, Task
+from stages.thermal.smooth import Curve, Smooth, Task
 from stages.thermal.targets import CHANNELS, thinned
 from stages.thermal.training import LEAST_SPAN, TrainingSet, training_set
 from tsmftis.effects import EFFECTS, scalars
@@ -41,8 +42,9 @@ Labels = NDArray[np.int64]
 
 BLOCKS = 400  # of all runs together: what a thermal time constant can fill, and a kernel matrix costs little
 SHORTEST_BLOCK_S = 10.0
-GROUPS, PIECES = 8, 24  # held out one by one: every eighth of so many pieces of the runs, ...
-FEWEST_IN_PIECE = 3  # ... of so many blocks at least
+FEWEST_BRANCHES = 3  # from which heating and cooling can be held out one by one
+HELPS = 0.9  # of the RMS in held-out branches, that a richer model of a single thermometer must come under
+DEGREES = (1, 2, 3, 4, 5, 6)  # of the curve in its temperature
 HALF_WIDTHS = (0.02, 0.04, 0.08, 0.16, 0.32)  # of the span
 LAGS_S = (30.0, 100.0, 300.0, 900.0)
 LAG_STEP_S = 2.0
@@ -85,13 +87,14 @@ class Run:
 
 @dataclass(frozen=True)
 class Axis:
-    """One channel: number, bias and features (N,), (N, F), those that vary with their mean and spread, noise σ of a block."""
+    """One channel: number, bias and features (N,), (N, F), those `used` (F,) that vary and belong to the model, noise σ of a block."""
 
     number: int
     bias: Array
     features: Array
     used: NDArray[np.bool_]
     sigma: float
+    degree: int | None = None
 
     @classmethod
     def of(cls, number: int, data: TrainingSet) -> Axis:
@@ -107,6 +110,23 @@ class Axis:
     @property
     def lags(self) -> bool:
         return self.number < 3 and bool(self.used[0])
+
+    def simplest(self, levels: Array, branch: Labels) -> Axis:
+        """Of a single thermometer, whose rate and history are one another's image in a single run: the curve in T, and whether the
+        rate belongs to it, that best predict branches (N,) held out. A richer model must do so by a tenth."""
+        if not self.used[:2].all():
+            return self
+        best, lowest = self, np.inf
+        for rate in (False, True):
+            for degree in DEGREES:
+                used = self.used & np.array([True, rate])
+                trial = replace(self, used=used, degree=degree)
+                x = trial.scaled(self.features)
+                columns = np.column_stack([levels, x, Curve.of(degree, x, self.bias, levels, 1.0).columns])
+                missed = held_out(columns, self.bias, branch)
+                if missed < HELPS * lowest:
+                    best, lowest = trial, missed
+        return best
 
 
 def _noise(bias: Array, starts: NDArray[np.bool_]) -> float:
@@ -135,7 +155,28 @@ def residual_problem(
     data = training_set(chambers, settings, Memory.of(known))
     runs = [Run.of(c, settings) for c in chambers]
     axes = [Axis.of(i, data) for i in range(6) if not data.refused[i]] or [Axis.of(i, data) for i in range(6)]
-    return _Builder(settings, data, runs, axes, known).problem()
+    levels = np.column_stack([1.0 * (data.run == i) for i in range(len(runs))])
+    group, names = pieces(data.run), dict[int, str]()
+    if data.thermometers == 1:
+        branch, called = _branches(runs, data.run, axes[0].features[:, 0])
+        if len(called) >= FEWEST_BRANCHES:
+            group, names = branch, called
+            axes = [a.simplest(levels, branch) for a in axes]
+    return _Builder(settings, data, runs, axes, known, levels, group, names).problem()
+
+
+def _branches(runs: Sequence[Run], run: Labels, temperature: Array) -> tuple[Labels, dict[int, str]]:
+    """Branch of each block (N,) of all runs, and their names."""
+    group = np.empty(len(run), np.int64)
+    names: dict[int, str] = {}
+    for r, one in enumerate(runs):
+        label, rising = branches(temperature[run == r])
+        group[run == r] = label + len(names)
+        names |= {
+            len(names) + k: f"{one.chamber.name}, {'heating' if up else 'cooling'} ({k + 1})"
+            for k, up in enumerate(rising)
+        }
+    return group, names
 
 
 @dataclass(frozen=True)
@@ -145,11 +186,14 @@ class _Builder:
     runs: Sequence[Run]
     axes: Sequence[Axis]
     known: Mapping[str, Mapping[str, Any]]
+    levels: Array
+    group: Labels
+    names: Mapping[int, str]
 
     def problem(self) -> ResidualProblem:
         n = len(self.data.bias)
         time = np.concatenate([r.time for r in self.runs])
-        levels = np.column_stack([1.0 * (self.data.run == i) for i in range(len(self.runs))])
+        levels = self.levels
         span = float(np.ptp(np.vstack([r.mean for r in self.runs]), axis=0).max())
         widths = [share * span for share in HALF_WIDTHS]
         behind = lru_cache(maxsize=64)(lambda h: np.vstack([r.behind(h) for r in self.runs]))
@@ -172,7 +216,7 @@ class _Builder:
         bias = [
             axis.bias - c @ np.linalg.lstsq(c, axis.bias, rcond=None)[0] for axis, c in zip(self.axes, own, strict=True)
         ]
-        sigma = [fit.kernel.sigma for fit in fits]
+        sigma = [fit.sigma for fit in fits]
         functions = self._functions(fits, levels, beside, time, felt) if lags else {}
         null = {i: f(self.axes[i].scaled(self.axes[i].features)) for i, f in functions.items()}
 
@@ -191,11 +235,10 @@ class _Builder:
             return out.ravel()
 
         count = len(self.axes)
-        group, names = self._groups()
         made = []
-        for i, columns in enumerate(own):
-            wide = np.zeros((count, n, columns.shape[1]))
-            wide[i] = columns
+        for i, model in enumerate(own):
+            wide = np.zeros((count, n, model.shape[1]))
+            wide[i] = model
             made.append(wide.reshape(count * n, -1))
         candidates = [self._hysteresis(widths, span)] if plays else []
         candidates += [self._lag(total=float(sum(np.ptp(r.time) for r in self.runs)))] if lags else []
@@ -203,14 +246,14 @@ class _Builder:
             stage="thermal",
             residual=residual,
             candidates=tuple(candidates),
-            group=np.tile(group, count),
+            group=np.tile(self.group, count),
             series=np.concatenate([i * len(self.runs) + self.data.run for i in range(count)]),
             time=np.tile(time, count),
             nuisance=np.hstack(made),
             channel=np.repeat([a.number for a in self.axes], n),
             covariates=self._covariates(time, felt),
             unit="noises of a block",
-            group_names=names,
+            group_names=self.names,
         )
 
     def _felt(self, lag: float) -> tuple[Array, Array]:
@@ -221,31 +264,32 @@ class _Builder:
         """Features (N, F) of an axis with T and Ṫ after a lag."""
         return np.column_stack([felt[0][:, axis.number], felt[1][:, axis.number], axis.features[:, 2:]])
 
-    def _fit(self, axis: Axis, x: Array, levels: Array, memories: Array, time: Array) -> Smooth:
+    def _fit(self, axis: Axis, x: Array, levels: Array, memories: Array, time: Array) -> Smooth | Curve:
         """What the channel's model can take up; of a temperature that hardly moves a straight line is all."""
-        if x.shape[1] == 0:
-            return Smooth.none(len(x), axis.sigma)
+        if axis.degree is not None or x.shape[1] == 0:
+            return Curve.of(axis.degree or 1, x, axis.bias, levels, axis.sigma)
         task = Task(x, axis.bias, np.column_stack([levels, x, memories]), self.data.run, time)
         return Smooth.of(smooth.find(task), x, axis.bias, levels)
 
     def _functions(
-        self, fits: Sequence[Smooth], levels: Array, memories: Sequence[Array], time: Array, felt: Any
-    ) -> dict[int, Smooth]:
+        self, fits: Sequence[Smooth | Curve], levels: Array, memories: Sequence[Array], time: Array, felt: Any
+    ) -> dict[int, Smooth | Curve]:
         """The function of each gyro that a lag acts on."""
         mine = {i: f for i, f in enumerate(fits) if self.axes[i].lags}
-        best = (0.0, mine)
-        flat = {i: np.column_stack([levels, fits[i].x, memories[i]]) for i in mine}
-        nothing = self._evidence(mine, 0.0, flat, time, felt)
+        learnt = {i: f for i, f in mine.items() if isinstance(f, Smooth)}
+        best: tuple[float, dict[int, Smooth]] = (0.0, learnt)
+        flat = {i: np.column_stack([levels, fits[i].x, memories[i]]) for i in learnt}
+        nothing = self._evidence(learnt, 0.0, flat, time, felt)
         for lag in LAGS_S:
-            gain = self._evidence(mine, lag, flat, time, felt) - nothing - DOUBT
+            gain = self._evidence(learnt, lag, flat, time, felt) - nothing - DOUBT
             if gain > best[0]:
                 made = {}
-                for i, f in mine.items():
+                for i, f in learnt.items():
                     axis = self.axes[i]
                     x = axis.scaled(self._lagged(axis, felt(lag)))
                     made[i] = Smooth.of(f.kernel, x, axis.bias, levels)
                 best = (gain, made)
-        return best[1]
+        return mine | best[1]
 
     def _evidence(
         self, fits: Mapping[int, Smooth], lag: float, flat: Mapping[int, Array], time: Array, felt: Any
@@ -285,25 +329,6 @@ class _Builder:
         largest = min(effect.largest["lag"], max(0.5 * total, 2.0 * LAG_STEP_S))
         parameter = Parameter(effect.units["lag"], largest, 0.0, min(PLAUSIBLE_LAG_S, largest), LAG_STEP_S)
         return Candidate("thermal_lag", {"lag": parameter}, tuple({"lag": v} for v in LAGS_S if v < largest))
-
-    def _groups(self) -> tuple[Labels, dict[int, str]]:
-        """Every so many-th piece of the runs (N,), and the names of these groups.
-
-        A whole branch held out would be predicted from where the features have never been: an RMS of 2 to 26 noises on clean units,
-        where interleaved pieces have 1.1 to 1.5.
-        """
-        n = len(self.data.bias)
-        length = max(n / PIECES, FEWEST_IN_PIECE)
-        piece, begun = np.empty(n, np.int64), 0
-        for r in range(len(self.runs)):
-            mine = np.flatnonzero(self.data.run == r)
-            count = max(1, round(len(mine) / length))
-            piece[mine] = begun + np.arange(len(mine)) * count // len(mine)
-            begun += count
-        groups = min(GROUPS, begun)
-        minutes = length * self.settings.block_s / 60.0
-        names = {k: f"every {groups}th piece of {minutes:.0f} min from the {k + 1}th" for k in range(groups)}
-        return piece % groups, names
 
     def _covariates(self, time: Array, felt: Any) -> dict[str, Array]:
         n, count = len(time), len(self.axes)

@@ -12,6 +12,7 @@ Classes and functions
 ---------------------
 Kernel      the hyperparameters
 Smooth      columns of a channel and the function fitted to it
+Curve       the same of a polynomial in T, where little more can be told
 find        hyperparameters of the largest evidence
 evidence    their evidence on other features
 
@@ -159,17 +160,46 @@ class Smooth:
         slope = inverse @ (y - covariance @ weights)
         return cls(kernel, x, columns, slope[levels.shape[1] :], weights)
 
-    @classmethod
-    def none(cls, count: int, sigma: float) -> Smooth:
-        """Of no features, with the noise of a block."""
-        return cls(
-            Kernel(np.array([0.0, 0.0, 0.0, np.log(sigma)])),
-            np.zeros((count, 0)),
-            np.zeros((count, 0)),
-            np.zeros(0),
-            np.zeros(count),
-        )
+    @property
+    def sigma(self) -> float:
+        """Noise of a block."""
+        return self.kernel.sigma
 
     def __call__(self, x: Array) -> Array:
         """The function at features (n, D), but for the run's level."""
         return np.asarray(x @ self.slope + self.kernel.between(x, self.x) @ self.weights)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A polynomial in the first feature beside straight lines in all, fitted to y: what little can be extrapolated to another
+    branch. As `Smooth`, but for the noise of a block `sigma`, which is given.
+    """
+
+    x: Array
+    columns: Array
+    sigma: float
+    low: float
+    high: float
+    slope: Array
+    weights: Array
+
+    @classmethod
+    def of(cls, degree: int, x: Array, y: Array, levels: Array, sigma: float) -> Curve:
+        """`degree` of the polynomial, 1 at least; x (N, D), D may be 0."""
+        low, high = (float(x[:, 0].min()), float(x[:, 0].max())) if x.shape[1] else (0.0, 1.0)
+        columns = _powers(x, low, high, degree)
+        beta = np.linalg.lstsq(np.column_stack([levels, x, columns]), y, rcond=None)[0][levels.shape[1] :]
+        return cls(x, columns, sigma, low, high, beta[: x.shape[1]], beta[x.shape[1] :])
+
+    def __call__(self, x: Array) -> Array:
+        """The function at features (n, D), but for the run's level."""
+        powers = _powers(x, self.low, self.high, len(self.weights) + 1)
+        return np.asarray(x @ self.slope + powers @ self.weights)
+
+
+def _powers(x: Array, low: float, high: float, degree: int) -> Array:
+    """Legendre polynomials of degree 2 and more of the first feature (n, degree − 1), none without features."""
+    if x.shape[1] == 0:
+        return np.zeros((len(x), 0))
+    return np.polynomial.legendre.legvander((2.0 * x[:, 0] - low - high) / (high - low), degree)[:, 2:]
