@@ -1,12 +1,12 @@
 """Certification of the thermal stage's part of the closed loop on simulated chamber runs whose truth is known.
 
-    python benchmarks/loop_thermal.py [--trials 8] [--seed 1] [--noise white random-walk] [--size 4 8] [--only clean power without]
+    python benchmarks/loop_thermal.py [--trials 8] [--seed 1] [--noise white random-walk] [--size 4 8]
 
-Units of the preset `survey` run through the paper's two chamber profiles; written by `tsmftis.simulator`, which shares no model with
-the pipeline. Noise: white as the preset has it, and a random walk or a Gauss–Markov process of an hour on top of every output. An effect's
-size is in its own sigma: of a gyro amplitude that all axes share, or of the lag, with all else estimated (Cramér–Rao, in the
-true noise). Printed: false alarms on clean data with their one-sided 95 % bound, what is found at each size, and what is answered if
-the effect is not in the library.
+Units of the preset `survey` run through the paper's two chamber profiles; written by `tsmftis.simulator`, which shares
+no model with the pipeline. Noise: white as the preset has it, and a random walk or a Gauss–Markov process of an hour on
+top of every output. An effect's size is in its own sigma: of a gyro amplitude that all axes share, or of the lag, with
+all else estimated (Cramér–Rao, in the true noise). Printed: false alarms on clean data with their one-sided 95 % bound,
+what is found at each size, and what is answered if the effect is not in the library.
 """
 
 from __future__ import annotations

@@ -56,8 +56,8 @@ class Candidate:
 
     grid: values of the parameters that the residual is not linear in, each entry one start and one test of its own. Where the
     residual there is that of the null (the width of a play whose amplitude is zero), the other parameters are differentiated
-    there; where it is not (a lag), the secant from the null to there is the signature. A parameter that an entry puts to zero, its
-    null, is left out of the effect where that entry is the one that fits: one axis alone, say.
+    there; where it is not (a lag), the secant from the null to there is the signature. A parameter that an entry puts to
+    zero, its null, is left out of the effect where that entry is the one that fits: one axis alone, say.
     """
 
     effect: str

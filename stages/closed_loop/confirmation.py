@@ -50,9 +50,10 @@ class Model:
 
 @dataclass(frozen=True)
 class Confirmation:
-    """RMS of all held-out samples of the channels acted on, in units of the residual (channels weighted by their spread), the gain in log-likelihood, in
-    how many folds the same one was chosen, whether its sign is the same in all; `without_best`: the gain in log-likelihood
-    without the fold that gains most, so that no single group decides."""
+    """RMS of held-out samples of the channels acted on, in units of the residual (channels weighted by their spread), the
+    gain in log-likelihood, in how many folds the same one was chosen, whether its sign is the same in all;
+    `without_best`: the gain in log-likelihood without the fold that gains most, so that no single group decides.
+    """
 
     before: float
     after: float

@@ -111,9 +111,7 @@ def estimate(
 
 
 def _signatures(problem: ResidualProblem, values: Values, candidates: Mapping[str, Candidate]) -> Array:
-    return np.column_stack(
-        [derivatives(problem, values, candidates[e], _named(values, candidates[e])) for e in values]
-    )
+    return np.column_stack([derivatives(problem, values, candidates[e], _named(values, candidates[e])) for e in values])
 
 
 def _named(values: Values, candidate: Candidate) -> tuple[str, ...]:

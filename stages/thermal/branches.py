@@ -44,8 +44,8 @@ def branches(temperature: Array) -> tuple[Labels, list[bool]]:
 def pieces(run: Labels) -> Labels:
     """Groups (N,) of blocks of the runs (N,): stretches of a few minutes, every eighth of them one group.
 
-    A whole branch held out of features of many thermometers would be predicted where they have never been: on clean simulated units
-    with an RMS of 2 to 26 noises, where short stretches have 1.04 to 1.2.
+    A whole branch held out would be predicted where the features of many thermometers have never been: on clean simulated
+    units with an RMS of 2 to 26 noises, where short stretches have 1.04 to 1.2.
     """
     length = max(len(run) / PIECES, FEWEST_IN_PIECE)
     piece, begun = np.empty(len(run), np.int64), 0

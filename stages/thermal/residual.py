@@ -42,10 +42,10 @@ Labels = NDArray[np.int64]
 
 BLOCKS = 400  # of all runs together: what a thermal time constant can fill, and a kernel matrix costs little
 SHORTEST_BLOCK_S = 10.0
-FEWEST_BRANCHES = 3  # from which heating and cooling can be held out one by one
+BRANCHES = 3  # of a single thermometer, from which they are held out one by one
 HELPS = 0.9  # of the RMS in held-out branches, that a richer model of a single thermometer must come under
 DEGREES = (1, 2, 3, 4, 5, 6)  # of the curve in its temperature
-HALF_WIDTHS = (0.02, 0.04, 0.08, 0.16, 0.32)  # of the span
+HALF_WIDTHS = (0.04, 0.08, 0.16, 0.32)  # of the span; less looks like the noise and the delay of thermometers
 LAGS_S = (30.0, 100.0, 300.0, 900.0)
 LAG_STEP_S = 2.0
 PLAUSIBLE_SHARE = 0.3  # of the RMS of a channel's bias: an amplitude worth naming
@@ -87,7 +87,10 @@ class Run:
 
 @dataclass(frozen=True)
 class Axis:
-    """One channel: number, bias and features (N,), (N, F), those `used` (F,) that vary and belong to the model, noise σ of a block."""
+    """One channel: number, bias (N,), features (N, F), those `used` (F,) that vary and belong to the model, noise σ of a block.
+
+    `degree` of the curve in T that is its model; None where that is all the network could learn.
+    """
 
     number: int
     bias: Array
@@ -112,8 +115,9 @@ class Axis:
         return self.number < 3 and bool(self.used[0])
 
     def simplest(self, levels: Array, branch: Labels) -> Axis:
-        """Of a single thermometer, whose rate and history are one another's image in a single run: the curve in T, and whether the
-        rate belongs to it, that best predict branches (N,) held out. A richer model must do so by a tenth."""
+        """Of a single thermometer, whose rate and history are one another's image: the curve in T, and whether the rate belongs
+        to it, that best predict branches (N,) held out. A richer model must do so by a tenth.
+        """
         if not self.used[:2].all():
             return self
         best, lowest = self, np.inf
@@ -156,13 +160,14 @@ def residual_problem(
     runs = [Run.of(c, settings) for c in chambers]
     axes = [Axis.of(i, data) for i in range(6) if not data.refused[i]] or [Axis.of(i, data) for i in range(6)]
     levels = np.column_stack([1.0 * (data.run == i) for i in range(len(runs))])
-    group, names = pieces(data.run), dict[int, str]()
-    if data.thermometers == 1:
-        branch, called = _branches(runs, data.run, axes[0].features[:, 0])
-        if len(called) >= FEWEST_BRANCHES:
-            group, names = branch, called
-            axes = [a.simplest(levels, branch) for a in axes]
-    return _Builder(settings, data, runs, axes, known, levels, group, names).problem()
+    branch, called = _branches(runs, data.run, axes[0].features[:, 0])
+    if data.thermometers == 1 and len(called) >= BRANCHES:
+        group, names = branch, called
+        axes = [a.simplest(levels, branch) for a in axes]
+    else:
+        group = pieces(data.run)
+        names = {int(k): f"stretches in turn, group {k + 1}" for k in np.unique(group)}
+    return _Builder(settings, data, runs, axes, known, levels, group, names, len(called) == 1).problem()
 
 
 def _branches(runs: Sequence[Run], run: Labels, temperature: Array) -> tuple[Labels, dict[int, str]]:
@@ -189,13 +194,14 @@ class _Builder:
     levels: Array
     group: Labels
     names: Mapping[int, str]
+    monotone: bool
 
     def problem(self) -> ResidualProblem:
         n = len(self.data.bias)
         time = np.concatenate([r.time for r in self.runs])
         levels = self.levels
         span = float(np.ptp(np.vstack([r.mean for r in self.runs]), axis=0).max())
-        widths = [share * span for share in HALF_WIDTHS]
+        widths = [share * max(span, LEAST_SPAN[0]) for share in HALF_WIDTHS]
         behind = lru_cache(maxsize=64)(lambda h: np.vstack([r.behind(h) for r in self.runs]))
         felt = lru_cache(maxsize=64)(self._felt)
         plays = "thermal_hysteresis" not in self.known
@@ -212,6 +218,8 @@ class _Builder:
             np.column_stack([levels, axis.scaled(axis.features), fit.columns])
             for axis, fit in zip(self.axes, fits, strict=True)
         ]
+        if self.monotone:  # there play and lag are functions of T like any other, and only T and time can be told
+            own = [np.column_stack([c, b]) for c, b in zip(own, beside, strict=True)]
         # What N can take up anyway is taken out beforehand, so that a channel's RMS is that of what is left.
         bias = [
             axis.bias - c @ np.linalg.lstsq(c, axis.bias, rcond=None)[0] for axis, c in zip(self.axes, own, strict=True)

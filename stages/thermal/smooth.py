@@ -190,7 +190,9 @@ class Curve:
         low, high = (float(x[:, 0].min()), float(x[:, 0].max())) if x.shape[1] else (0.0, 1.0)
         columns = _powers(x, low, high, degree)
         beta = np.linalg.lstsq(np.column_stack([levels, x, columns]), y, rcond=None)[0][levels.shape[1] :]
-        return cls(x, columns, sigma, low, high, beta[: x.shape[1]], beta[x.shape[1] :])
+        return cls(
+            x, columns, sigma, low, high, np.asarray(beta[: x.shape[1]], float), np.asarray(beta[x.shape[1] :], float)
+        )
 
     def __call__(self, x: Array) -> Array:
         """The function at features (n, D), but for the run's level."""
@@ -202,4 +204,6 @@ def _powers(x: Array, low: float, high: float, degree: int) -> Array:
     """Legendre polynomials of degree 2 and more of the first feature (n, degree − 1), none without features."""
     if x.shape[1] == 0:
         return np.zeros((len(x), 0))
-    return np.polynomial.legendre.legvander((2.0 * x[:, 0] - low - high) / (high - low), degree)[:, 2:]
+    return np.asarray(
+        np.polynomial.legendre.legvander((2.0 * x[:, 0] - low - high) / (high - low), degree)[:, 2:], float
+    )
