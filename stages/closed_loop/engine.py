@@ -128,8 +128,8 @@ def _limits(
     """Noise with every candidate projected off: an effect must not hide itself."""
     found = _members(problem, state, candidates)
     rows, p = layout.rows, state.nuisance.shape[1]
-    if not found:
-        return []
+    if not found:  # none leaves a trace, which must be said
+        return identifiability.limits(np.zeros((1, 1)), [], [], candidates, settings.snr)
     both = np.column_stack([state.nuisance, *(m.columns for m in found)])[rows]
     noise = fit_noise(layout, both, state.residual[rows], state.noise)
     m = project(gram(layout, noise, np.column_stack([both, state.residual[rows]])), slice(0, p))
