@@ -59,7 +59,8 @@ class Candidate:
 
     grid: values of the parameters that the residual is not linear in, each entry one start and one test of its own. Where the
     residual there is that of the null (the width of a play whose amplitude is zero), the other parameters are differentiated
-    there; where it is not (a lag), the secant from the null to there is the signature.
+    there; where it is not (a lag), the secant from the null to there is the signature. A parameter that an entry puts to
+    zero, its null, is left out of the effect where that entry is the one that fits: one axis alone, say.
     """
 
     effect: str
@@ -137,7 +138,7 @@ def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
     """Problems of one instrument under one set of parameters, by name (a flight's), one after the other.
 
     Groups, series, channels and nuisance are each problem's own; candidates, sigma and floor those of the first; covariates those
-    that all have. A single problem stays as it is.
+    that all have, but for bases. A single problem stays as it is.
     """
     parts = list(problems.values())
     first = parts[0]
@@ -153,7 +154,8 @@ def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
             own[kind].append(new + start)
         for old, new_label in zip(part.group.tolist(), own["group"][-1].tolist(), strict=True):
             names[new_label] = f"{name} {part.group_names.get(old, old)}"
-    shared = [k for k in first.covariates if all(k in part.covariates for part in parts)]
+    plain = [{k: v for k, v in part.covariates.items() if not isinstance(v, Basis)} for part in parts]
+    shared = [k for k in plain[0] if all(k in one for one in plain)]
     return replace(
         first,
         residual=lambda parameters: np.concatenate([part.residual(parameters) for part in parts]),
@@ -162,6 +164,6 @@ def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
         channel=np.concatenate(own["channel"]),
         time=np.concatenate([part.time for part in parts]),
         nuisance=block_diag(*(part.nuisance for part in parts)),
-        covariates={k: np.concatenate([part.covariates[k] for part in parts]) for k in shared},
+        covariates={k: np.concatenate([one[k] for one in plain]) for k in shared},
         group_names=names,
     )

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from flows.loop.problems import Part, inputs_of, picked_px, problem_of, settings_of
 from flows.steps import Paths, Plan, plain
 from pipeline.datasets import write_dataset
-from pipeline.residual_problem import ResidualProblem
+from pipeline.residual_problem import Basis, ResidualProblem
 from pipeline.run_stage import StageRecord, run_stage, write_json
 from stages import closed_loop
 from stages.closed_loop import LoopResult
@@ -132,6 +132,7 @@ def pictures_of(problem: ResidualProblem, result: LoopResult) -> xr.Dataset:
     }
     variables |= {f"term_{name}": ("sample", term, unit) for name, term in result.pictures.terms.items()}
     variables |= {
-        f"covariate_{i}": ("sample", x, {"long_name": name}) for i, (name, x) in enumerate(problem.covariates.items())
+        f"covariate_{i}": ("sample", x.values if isinstance(x, Basis) else x, {"long_name": name})
+        for i, (name, x) in enumerate(problem.covariates.items())
     }
     return xr.Dataset(variables, attrs={"stage": problem.stage})

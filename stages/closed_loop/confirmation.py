@@ -50,9 +50,10 @@ class Model:
 
 @dataclass(frozen=True)
 class Confirmation:
-    """RMS of all held-out samples in units of the residual (channels weighted by their spread), the gain in log-likelihood, in
-    how many folds the same one was chosen, whether its sign is the same in all; `without_best`: the gain in log-likelihood
-    without the fold that gains most, so that no single group decides."""
+    """RMS of held-out samples of the channels acted on, in units of the residual (channels weighted by their spread), the
+    gain in log-likelihood, in how many folds the same one was chosen, whether its sign is the same in all;
+    `without_best`: the gain in log-likelihood without the fold that gains most, so that no single group decides.
+    """
 
     before: float
     after: float
@@ -129,6 +130,7 @@ def confirm(
     """`library`: what each member would make of the model (its columns are before's and its own); `families`: their effects;
     `refined`: the chosen one's, linearised where it converged."""
     spread = channel_spread(problem, rows, refined, noise)
+    touched = _touched(problem, refined.term)
     totals = np.zeros(2)
     agree, same, gains = 0, True, []
     folds = [rows[f] for f in folds_of(problem.group[rows])]
@@ -156,9 +158,10 @@ def confirm(
             term = refined.term + refined.columns[:, refined.added] @ beta[list(refined.added)]
             same &= bool(term[rows] @ refined.term[rows] > 0.0)
         gains.append(l1 - l0)
-        totals += [float(np.sum((e / spread[held]) ** 2)) for e in (e0, e1)]
-    typical = float(np.sqrt(np.mean(spread[rows] ** 2)))
-    rms = typical * np.sqrt(totals / rows.size)
+        totals += [float(np.sum((e / spread[held])[touched[held]] ** 2)) for e in (e0, e1)]
+    counted = rows[touched[rows]]
+    typical = float(np.sqrt(np.mean(spread[counted] ** 2)))
+    rms = typical * np.sqrt(totals / counted.size)
     return Confirmation(
         float(rms[0]),
         float(rms[1]),
@@ -169,6 +172,15 @@ def confirm(
         same and agree > 0,
         float(np.sum(gains) - np.max(gains)),
     )
+
+
+def _touched(problem: ResidualProblem, term: Array) -> NDArray[np.bool_]:
+    """Samples (n,) of the channels that a term (n,) acts on: what it cannot change must not dilute its gain."""
+    every = np.ones(problem.group.size, bool)
+    if problem.channel is None or not term.any():
+        return every
+    acting = [one for one in np.unique(problem.channel) if term[problem.channel == one].any()]
+    return np.isin(problem.channel, acting)
 
 
 def channel_spread(problem: ResidualProblem, rows: Index, model: Model, noise: Noise) -> Array:

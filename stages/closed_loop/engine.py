@@ -54,7 +54,7 @@ class State:
     residual: Array
     estimate: Estimate | None = None
     steps: list[Step] = field(default_factory=list)
-    blocked: set[str] = field(default_factory=set)
+    blocked: set[tuple[str, tuple[str, ...]]] = field(default_factory=set)
     dropped: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     certain: list[str] = field(default_factory=list)
@@ -148,8 +148,8 @@ def _first_look(
     itself."""
     found = _members(problem, state, candidates)
     rows, p = layout.rows, state.nuisance.shape[1]
-    if not found:
-        return [], {}
+    if not found:  # none leaves a trace, which must be said
+        return identifiability.limits(np.zeros((1, 1)), [], [], candidates, settings.snr), {}
     both = np.column_stack([state.nuisance, *(m.columns for m in found)])[rows]
     noise = fit_noise(layout, both, state.residual[rows], state.noise)
     m = project(gram(layout, noise, np.column_stack([both, state.residual[rows]])), slice(0, p))
@@ -167,9 +167,10 @@ def _first_look(
 
 
 def _members(problem: ResidualProblem, state: State, candidates: Mapping[str, Candidate]) -> list[Member]:
-    out = {*state.values, *state.blocked, *state.dropped}
+    out = {*state.values, *state.dropped}
     free = [c for name, c in candidates.items() if name not in out]
-    return [m for c in free for m in members(problem, state.values, state.residual, c)]
+    found = [m for c in free for m in members(problem, state.values, state.residual, c)]
+    return [m for m in found if (m.effect, m.names) not in state.blocked]
 
 
 def _named_step(
@@ -192,11 +193,12 @@ def _named_step(
         member = found[finding.index]
         step = _examine(problem, layout, state, candidates, found, finding, settings, rng)
         if isinstance(step, Refusal):
-            state.notes.append(f"{member.effect} stands out (p {_p_text(finding.p)}) but is not added: {step.why}")
+            of = f" of {', '.join(member.names)}" if 0.0 in member.point.values() else ""
+            state.notes.append(f"{member.effect}{of} stands out (p {_p_text(finding.p)}) but is not added: {step.why}")
             state.refused[member.effect] = step.why
             if step.structure and finding.p < CERTAIN:
                 state.certain.append(member.effect)
-            state.blocked.add(member.effect)
+            state.blocked.add((member.effect, member.names))
             continue
         added, record = step
         state.estimate, state.residual, state.noise = added, added.residual, added.noise
@@ -379,7 +381,7 @@ def _drop_unneeded(
         for effect in e.values:
             own = [p + c for c in e.columns(effect)]
             others = [p + c for c in range(len(e.order)) if p + c not in own]
-            at = np.array([e.values[effect][name] for name in candidates[effect].parameters])
+            at = np.array([e.values[effect][e.order[c - p][1]] for c in own])
             information = project(m, others)[np.ix_(own, own)]
             rank = sum(bool(v > 0.0) for v in np.diag(information)) or 1
             p_value = float(chdtrc(rank, max(at @ information @ at, 0.0)))

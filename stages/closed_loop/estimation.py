@@ -55,9 +55,10 @@ def estimate(
 ) -> Estimate:
     """From `values` to the minimum over all their parameters; `nuisance` (n, p) over all samples, of which layout.rows count.
 
-    A parameter on its physical bound stays there and is named in `at_bound`. Far from the minimum the misfit itself looks like
-    coloured noise, in which the descent can come to rest: where plain least squares would leave much less, it is begun again from
-    there, and the likelier of both is the answer.
+    A parameter on its physical bound stays there and is named in `at_bound`; one that `values` does not name stays at zero.
+
+    Far from the minimum the misfit itself looks like coloured noise, in which the descent can come to rest: where plain least
+    squares would leave much less, it is begun again from there, and the likelier of both is the answer.
     """
     found = _descend(problem, layout, nuisance, values, candidates, noise)
     if not _rests_early(layout, nuisance, found):
@@ -96,11 +97,11 @@ def _descend(
     rounds: int = ROUNDS,
 ) -> Estimate:
     """Gauss–Newton in the given noise, then in the noise that it leaves, in turn."""
-    order = tuple((effect, name) for effect in values for name in candidates[effect].parameters)
+    order = tuple((e, name) for e in values for name in _named(values, candidates[e]))
     rows, p = layout.rows, nuisance.shape[1]
     low = np.array([candidates[e].parameters[n].low for e, n in order])
     high = np.array([candidates[e].parameters[n].largest for e, n in order])
-    at = np.clip([values[e].get(n, 0.0) for e, n in order], low, high)
+    at = np.clip([values[e][n] for e, n in order], low, high)
     own = list(range(p, p + len(order)))
 
     def packed(vector: Array) -> Values:
@@ -151,9 +152,11 @@ def _descend(
 
 
 def _signatures(problem: ResidualProblem, values: Values, candidates: Mapping[str, Candidate]) -> Array:
-    return np.column_stack(
-        [derivatives(problem, values, candidates[e], tuple(candidates[e].parameters)) for e in values]
-    )
+    return np.column_stack([derivatives(problem, values, candidates[e], _named(values, candidates[e])) for e in values])
+
+
+def _named(values: Values, candidate: Candidate) -> tuple[str, ...]:
+    return tuple(name for name in candidate.parameters if name in values[candidate.effect])
 
 
 def _bounded_step(m: Array, own: Sequence[int], at: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:

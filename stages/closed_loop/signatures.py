@@ -34,8 +34,11 @@ class Member:
     secant: bool = False
 
     def start(self, amplitude: Array) -> dict[str, float]:
-        """Parameters that the linear fit (q,) of the columns stands for; a secant within 0.3 to 2 of its point."""
-        values = dict(self.point)
+        """Parameters that the linear fit (q,) of the columns stands for; a secant within 0.3 to 2 of its point.
+
+        What the grid point puts to zero, the null, is not named: it stays out of the estimate.
+        """
+        values = {name: value for name, value in self.point.items() if value != 0.0}
         if self.secant:
             share = float(np.clip(amplitude[0], 0.3, 2.0))
             values = {name: share * value for name, value in values.items()}

@@ -2,11 +2,11 @@
 
     r(θ) = [b − A·(play(T; h) − T)/h − (f(x_τ) − f(x))]/σ,        N = [level of each run, x, smooth functions of x]
 
-b are block means of output minus reference, the six channels one after the other, σ the noise of a channel's block, x its features
-(T, Ṫ, and ∇T1, ∇T2 where a gyro has three thermometers), which a lag τ makes x_τ for the gyros. N is what the network could learn of
-x (`smooth.py`); f, the function that a lag acts on, is fitted to the same blocks. Rate and gradients belong to N: without them a lag
-"explains" clean instruments. f is that of x, unless x of some lag explains the data better beyond doubt: a function fitted to lagged
-features has learnt some of the very noise that it is then tested on.
+b are block means of output minus reference, the six channels one after the other, σ the noise of a channel's block, x its
+features (T, Ṫ, and ∇T1, ∇T2 where a gyro has three thermometers), which a lag τ makes x_τ for the gyros. N is what the
+network could learn of x (`smooth.py`); f, the function that a lag acts on, is fitted to the same blocks. Rate and gradients
+belong to N: without them a lag "explains" clean instruments. f is that of x, unless x of some lag explains the data better
+beyond doubt: a function fitted to lagged features has learnt some of the very noise that it is then tested on.
 
 Functions
 ---------
@@ -16,7 +16,7 @@ residual_problem    of chamber runs
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -28,10 +28,11 @@ from pipeline.residual_problem import Candidate, Parameter, Parameters, Residual
 from stages.thermal import memory as history
 from stages.thermal import smooth
 from stages.thermal.binning import block_means
+from stages.thermal.branches import branches, held_out, pieces
 from stages.thermal.features import NAMES, STEPS_PER_TIME_CONSTANT, smoothed
 from stages.thermal.memory import Memory
 from stages.thermal.settings import ThermalSettings
-from stages.thermal.smooth import Smooth, Task
+from stages.thermal.smooth import Curve, Smooth, Task
 from stages.thermal.targets import CHANNELS, thinned
 from stages.thermal.training import LEAST_SPAN, TrainingSet, training_set
 from tsmftis.effects import EFFECTS, scalars
@@ -41,10 +42,10 @@ Labels = NDArray[np.int64]
 
 BLOCKS = 400  # of all runs together: what a thermal time constant can fill, and a kernel matrix costs little
 SHORTEST_BLOCK_S = 10.0
-GROUPS = 8  # about as many pieces of branches are held out one by one
-TURN = 0.1  # of the span of temperature, back from an extremum, that begins a new branch, ...
-LEAST_TURN_K = 1.0  # ... but this at least
-HALF_WIDTHS = (0.02, 0.04, 0.08, 0.16, 0.32)  # of the span
+BRANCHES = 3  # of a single thermometer, from which they are held out one by one
+HELPS = 0.9  # of the RMS in held-out branches, that a richer model of a single thermometer must come under
+DEGREES = (1, 2, 3, 4, 5, 6)  # of the curve in its temperature
+HALF_WIDTHS = (0.04, 0.08, 0.16, 0.32)  # of the span; less looks like the noise and the delay of thermometers
 LAGS_S = (30.0, 100.0, 300.0, 900.0)
 LAG_STEP_S = 2.0
 PLAUSIBLE_SHARE = 0.3  # of the RMS of a channel's bias: an amplitude worth naming
@@ -86,13 +87,17 @@ class Run:
 
 @dataclass(frozen=True)
 class Axis:
-    """One channel: number, bias and features (N,), (N, F), those that vary with their mean and spread, noise σ of a block."""
+    """One channel: number, bias (N,), features (N, F), those `used` (F,) that vary and belong to the model, noise σ of a block.
+
+    `degree` of the curve in T that is its model; None where that is all the network could learn.
+    """
 
     number: int
     bias: Array
     features: Array
     used: NDArray[np.bool_]
     sigma: float
+    degree: int | None = None
 
     @classmethod
     def of(cls, number: int, data: TrainingSet) -> Axis:
@@ -108,6 +113,24 @@ class Axis:
     @property
     def lags(self) -> bool:
         return self.number < 3 and bool(self.used[0])
+
+    def simplest(self, levels: Array, branch: Labels) -> Axis:
+        """Of a single thermometer, whose rate and history are one another's image: the curve in T, and whether the rate belongs
+        to it, that best predict branches (N,) held out. A richer model must do so by a tenth.
+        """
+        if not self.used[:2].all():
+            return self
+        best, lowest = self, np.inf
+        for rate in (False, True):
+            for degree in DEGREES:
+                used = self.used & np.array([True, rate])
+                trial = replace(self, used=used, degree=degree)
+                x = trial.scaled(self.features)
+                columns = np.column_stack([levels, x, Curve.of(degree, x, self.bias, levels, 1.0).columns])
+                missed = held_out(columns, self.bias, branch)
+                if missed < HELPS * lowest:
+                    best, lowest = trial, missed
+        return best
 
 
 def _noise(bias: Array, starts: NDArray[np.bool_]) -> float:
@@ -136,7 +159,29 @@ def residual_problem(
     data = training_set(chambers, settings, Memory.of(known))
     runs = [Run.of(c, settings) for c in chambers]
     axes = [Axis.of(i, data) for i in range(6) if not data.refused[i]] or [Axis.of(i, data) for i in range(6)]
-    return _Builder(settings, data, runs, axes, known).problem()
+    levels = np.column_stack([1.0 * (data.run == i) for i in range(len(runs))])
+    branch, called = _branches(runs, data.run, axes[0].features[:, 0])
+    if data.thermometers == 1 and len(called) >= BRANCHES:
+        group, names = branch, called
+        axes = [a.simplest(levels, branch) for a in axes]
+    else:
+        group = pieces(data.run)
+        names = {int(k): f"stretches in turn, group {k + 1}" for k in np.unique(group)}
+    return _Builder(settings, data, runs, axes, known, levels, group, names, len(called) == 1).problem()
+
+
+def _branches(runs: Sequence[Run], run: Labels, temperature: Array) -> tuple[Labels, dict[int, str]]:
+    """Branch of each block (N,) of all runs, and their names."""
+    group = np.empty(len(run), np.int64)
+    names: dict[int, str] = {}
+    for r, one in enumerate(runs):
+        label, rising = branches(temperature[run == r])
+        group[run == r] = label + len(names)
+        names |= {
+            len(names) + k: f"{one.chamber.name}, {'heating' if up else 'cooling'} ({k + 1})"
+            for k, up in enumerate(rising)
+        }
+    return group, names
 
 
 @dataclass(frozen=True)
@@ -146,34 +191,41 @@ class _Builder:
     runs: Sequence[Run]
     axes: Sequence[Axis]
     known: Mapping[str, Mapping[str, Any]]
+    levels: Array
+    group: Labels
+    names: Mapping[int, str]
+    monotone: bool
 
     def problem(self) -> ResidualProblem:
         n = len(self.data.bias)
         time = np.concatenate([r.time for r in self.runs])
-        levels = np.column_stack([1.0 * (self.data.run == i) for i in range(len(self.runs))])
+        levels = self.levels
         span = float(np.ptp(np.vstack([r.mean for r in self.runs]), axis=0).max())
-        widths = [share * span for share in HALF_WIDTHS]
+        widths = [share * max(span, LEAST_SPAN[0]) for share in HALF_WIDTHS]
         behind = lru_cache(maxsize=64)(lambda h: np.vstack([r.behind(h) for r in self.runs]))
         felt = lru_cache(maxsize=64)(self._felt)
         plays = "thermal_hysteresis" not in self.known
         lags = "thermal_lag" not in self.known and any(a.lags for a in self.axes)
         past = [felt(lag)[0] - felt(0.0)[0] for lag in LAGS_S] if lags else []
-        fits = []
+        beside, fits = [], []
         for axis in self.axes:
             x = axis.scaled(axis.features)
             columns = [behind(h)[:, axis.number] for h in widths] if plays else []
             columns += [p[:, axis.number] for p in past] if axis.lags else []
-            fits.append(self._fit(axis, x, levels, _independent(np.column_stack([levels, x]), columns), time))
+            beside.append(_independent(np.column_stack([levels, x]), columns))
+            fits.append(self._fit(axis, x, levels, beside[-1], time))
         own = [
             np.column_stack([levels, axis.scaled(axis.features), fit.columns])
             for axis, fit in zip(self.axes, fits, strict=True)
         ]
+        if self.monotone:  # there play and lag are functions of T like any other, and only T and time can be told
+            own = [np.column_stack([c, b]) for c, b in zip(own, beside, strict=True)]
         # What N can take up anyway is taken out beforehand, so that a channel's RMS is that of what is left.
         bias = [
             axis.bias - c @ np.linalg.lstsq(c, axis.bias, rcond=None)[0] for axis, c in zip(self.axes, own, strict=True)
         ]
-        sigma = [fit.kernel.sigma for fit in fits]
-        functions = self._functions(fits, levels, time, felt) if lags else {}
+        sigma = [fit.sigma for fit in fits]
+        functions = self._functions(fits, levels, beside, time, felt) if lags else {}
         null = {i: f(self.axes[i].scaled(self.axes[i].features)) for i, f in functions.items()}
 
         def residual(parameters: Parameters) -> Array:
@@ -191,11 +243,10 @@ class _Builder:
             return out.ravel()
 
         count = len(self.axes)
-        group, names = self._groups()
         made = []
-        for i, columns in enumerate(own):
-            wide = np.zeros((count, n, columns.shape[1]))
-            wide[i] = columns
+        for i, model in enumerate(own):
+            wide = np.zeros((count, n, model.shape[1]))
+            wide[i] = model
             made.append(wide.reshape(count * n, -1))
         candidates = [self._hysteresis(widths, span)] if plays else []
         candidates += [self._lag(total=float(sum(np.ptp(r.time) for r in self.runs)))] if lags else []
@@ -203,14 +254,14 @@ class _Builder:
             stage="thermal",
             residual=residual,
             candidates=tuple(candidates),
-            group=np.tile(group, count),
+            group=np.tile(self.group, count),
             series=np.concatenate([i * len(self.runs) + self.data.run for i in range(count)]),
             time=np.tile(time, count),
             nuisance=np.hstack(made),
             channel=np.repeat([a.number for a in self.axes], n),
             covariates=self._covariates(time, felt),
             unit="noises of a block",
-            group_names=names,
+            group_names=self.names,
         )
 
     def _felt(self, lag: float) -> tuple[Array, Array]:
@@ -221,38 +272,42 @@ class _Builder:
         """Features (N, F) of an axis with T and Ṫ after a lag."""
         return np.column_stack([felt[0][:, axis.number], felt[1][:, axis.number], axis.features[:, 2:]])
 
-    def _fit(self, axis: Axis, x: Array, levels: Array, memories: Array, time: Array) -> Smooth:
+    def _fit(self, axis: Axis, x: Array, levels: Array, memories: Array, time: Array) -> Smooth | Curve:
         """What the channel's model can take up; of a temperature that hardly moves a straight line is all."""
-        if x.shape[1] == 0:
-            return Smooth.none(len(x), axis.sigma)
+        if axis.degree is not None or x.shape[1] == 0:
+            return Curve.of(axis.degree or 1, x, axis.bias, levels, axis.sigma)
         task = Task(x, axis.bias, np.column_stack([levels, x, memories]), self.data.run, time)
         return Smooth.of(smooth.find(task), x, axis.bias, levels)
 
-    def _functions(self, fits: Sequence[Smooth], levels: Array, time: Array, felt: Any) -> dict[int, Smooth]:
+    def _functions(
+        self, fits: Sequence[Smooth | Curve], levels: Array, memories: Sequence[Array], time: Array, felt: Any
+    ) -> dict[int, Smooth | Curve]:
         """The function of each gyro that a lag acts on."""
         mine = {i: f for i, f in enumerate(fits) if self.axes[i].lags}
-        best = (0.0, mine)
-        nothing = self._evidence(mine, 0.0, levels, time, felt)
+        learnt = {i: f for i, f in mine.items() if isinstance(f, Smooth)}
+        best: tuple[float, dict[int, Smooth]] = (0.0, learnt)
+        flat = {i: np.column_stack([levels, fits[i].x, memories[i]]) for i in learnt}
+        nothing = self._evidence(learnt, 0.0, flat, time, felt)
         for lag in LAGS_S:
-            gain = self._evidence(mine, lag, levels, time, felt) - nothing - DOUBT
+            gain = self._evidence(learnt, lag, flat, time, felt) - nothing - DOUBT
             if gain > best[0]:
                 made = {}
-                for i, f in mine.items():
+                for i, f in learnt.items():
                     axis = self.axes[i]
                     x = axis.scaled(self._lagged(axis, felt(lag)))
                     made[i] = Smooth.of(f.kernel, x, axis.bias, levels)
                 best = (gain, made)
-        return best[1]
+        return mine | best[1]
 
-    def _evidence(self, fits: Mapping[int, Smooth], lag: float, levels: Array, time: Array, felt: Any) -> float:
+    def _evidence(
+        self, fits: Mapping[int, Smooth], lag: float, flat: Mapping[int, Array], time: Array, felt: Any
+    ) -> float:
+        """Of features after a lag, the same columns with flat priors beside them whatever the lag."""
         total = 0.0
         for i, f in fits.items():
             axis = self.axes[i]
             x = axis.scaled(self._lagged(axis, felt(lag)))
-            own = axis.scaled(axis.features)
-            flat = np.column_stack([levels, own])
-            extra = _independent(flat, [*x.T])
-            task = Task(x, axis.bias, np.column_stack([flat, extra]), self.data.run, time)
+            task = Task(x, axis.bias, flat[i], self.data.run, time)
             total += smooth.evidence(task, f.kernel)
         return total
 
@@ -268,32 +323,20 @@ class _Builder:
             elif (axis := numbers.get(name.replace(".", "_"))) is not None:
                 size = min(PLAUSIBLE_SHARE * float(axis.bias.std()), effect.largest[key])
                 parameters[name] = Parameter(effect.units[key], effect.largest[key], plausible=size)
-        return Candidate("thermal_hysteresis", parameters, tuple({"half_width": h} for h in widths))
+        names = [name for name in parameters if name != "half_width"]
+        sets = {tuple(n for n in names if n.startswith(which)) for which in ("", "gyro", "accel", *names)} - {()}
+        grid = [
+            {"half_width": h} | {n: 0.0 for n in names if n not in some}
+            for h in widths
+            for some in sorted(sets, key=len)
+        ]
+        return Candidate("thermal_hysteresis", parameters, tuple(grid))
 
     def _lag(self, total: float) -> Candidate:
         effect = EFFECTS["thermal_lag"]
         largest = min(effect.largest["lag"], max(0.5 * total, 2.0 * LAG_STEP_S))
         parameter = Parameter(effect.units["lag"], largest, 0.0, min(PLAUSIBLE_LAG_S, largest), LAG_STEP_S)
         return Candidate("thermal_lag", {"lag": parameter}, tuple({"lag": v} for v in LAGS_S if v < largest))
-
-    def _groups(self) -> tuple[Labels, dict[int, str]]:
-        """Pieces of branches, each heating or cooling (N,), and their names."""
-        parts = [
-            branches(r.time, r.mean[np.searchsorted(r.times, r.time).clip(0, len(r.times) - 1)].mean(axis=1))
-            for r in self.runs
-        ]
-        length = sum(len(p[0]) for p in parts) / GROUPS
-        group, names = [], {}
-        for run, (label, rising) in zip(self.runs, parts, strict=True):
-            for one in np.unique(label):
-                mine = np.count_nonzero(label == one)
-                pieces = max(1, round(mine / length))
-                for k, part in enumerate(np.array_split(np.arange(mine), pieces)):
-                    names[len(names)] = f"{run.chamber.name}, {'heating' if rising[one] else 'cooling'} {one + 1}" + (
-                        f", part {k + 1}" if pieces > 1 else ""
-                    )
-                    group.append(np.full(len(part), len(names) - 1))
-        return np.concatenate(group), names
 
     def _covariates(self, time: Array, felt: Any) -> dict[str, Array]:
         n, count = len(time), len(self.axes)
@@ -320,24 +363,3 @@ def _independent(flat: Array, columns: Sequence[Array]) -> Array:
     c = c - flat @ np.linalg.lstsq(flat, c, rcond=None)[0]
     u, s, _ = np.linalg.svd(c, full_matrices=False)
     return np.asarray(u[:, s > 1e-3])
-
-
-def branches(time: Array, temperature: Array) -> tuple[Labels, list[bool]]:
-    """Which branch each time (n,) is in, and whether branches heat: from one extremum of the temperature (n,) to the next."""
-    turn = max(TURN * float(np.ptp(temperature)), LEAST_TURN_K)
-    edges, rising = [0], []
-    low = high = 0
-    up: bool | None = None
-    for i, t in enumerate(temperature):
-        low, high = (i if t < temperature[low] else low), (i if t > temperature[high] else high)
-        if up is not True and t - temperature[low] > turn:
-            if up is False:
-                edges.append(low)
-            rising.append(True)
-            up, high = True, i
-        elif up is not False and temperature[high] - t > turn:
-            if up is True:
-                edges.append(high)
-            rising.append(False)
-            up, low = False, i
-    return np.searchsorted(edges[1:], np.arange(len(time)), side="right"), rising or [True]

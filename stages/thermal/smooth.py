@@ -2,16 +2,17 @@
 
     y = F·β + H·γ + f(x) + e,     f ~ GP(0, s²·σ²·exp(−½ Σ_d ((x_d − x'_d)/ℓ_d)²)),     e ~ σ²·(I + c²·exp(−|Δt|/τ) within a run)
 
-F holds a level for each run and a straight line in each feature, H what a memory of temperature could add. ℓ, s, c, τ, σ are those
-of the largest evidence with β and γ integrated out (flat priors, so this is restricted likelihood [1]_) times weak log-normal
-priors. H matters: without it widths shrink until f imitates the memory that is to be looked for, and the looking finds nothing;
-with it f has the widths that the rest of the data ask for. Of the kernel, freed of F, the directions v_k count that the prior lets
-rise above the noise of a block, λ_k > KEPT·σ².
+F holds a level for each run and a straight line in each feature, H what a memory of temperature could add. ℓ, s, c, τ, σ are
+those of the largest evidence with β and γ integrated out (flat priors, so this is restricted likelihood [1]_) times weak
+log-normal priors. H matters: without it widths shrink until f imitates the memory that is to be looked for, and the looking
+finds nothing; with it f has the widths that the rest of the data ask for. Of the kernel, freed of F, the directions v_k
+count that the prior lets rise above the noise of a block, λ_k > KEPT·σ².
 
 Classes and functions
 ---------------------
 Kernel      the hyperparameters
 Smooth      columns of a channel and the function fitted to it
+Curve       the same of a polynomial in T, where little more can be told
 find        hyperparameters of the largest evidence
 evidence    their evidence on other features
 
@@ -34,7 +35,7 @@ from stages.thermal.network import one_thread
 
 Array = NDArray[np.float64]
 
-KEPT = 0.3  # of a block's noise variance
+KEPT = 0.1  # of a block's noise variance: plays on 8 clean units then have an RMS of 1.0 sigma, 1.15 at 0.3
 LOG_WIDTH_MEAN, LOG_WIDTH_SIGMA = np.log(3.0), 1.0  # in standard deviations of the feature
 LOG_SIZE_MEAN, LOG_SIZE_SIGMA = 2.0, 3.0  # of f over the noise of a block
 LOG_COLOUR_MEAN, LOG_COLOUR_SIGMA = -2.0, 2.0  # of the coloured noise over the white one
@@ -159,17 +160,50 @@ class Smooth:
         slope = inverse @ (y - covariance @ weights)
         return cls(kernel, x, columns, slope[levels.shape[1] :], weights)
 
-    @classmethod
-    def none(cls, count: int, sigma: float) -> Smooth:
-        """Of no features, with the noise of a block."""
-        return cls(
-            Kernel(np.array([0.0, 0.0, 0.0, np.log(sigma)])),
-            np.zeros((count, 0)),
-            np.zeros((count, 0)),
-            np.zeros(0),
-            np.zeros(count),
-        )
+    @property
+    def sigma(self) -> float:
+        """Noise of a block."""
+        return self.kernel.sigma
 
     def __call__(self, x: Array) -> Array:
         """The function at features (n, D), but for the run's level."""
         return np.asarray(x @ self.slope + self.kernel.between(x, self.x) @ self.weights)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A polynomial in the first feature beside straight lines in all, fitted to y: what little can be extrapolated to another
+    branch. As `Smooth`, but for the noise of a block `sigma`, which is given.
+    """
+
+    x: Array
+    columns: Array
+    sigma: float
+    low: float
+    high: float
+    slope: Array
+    weights: Array
+
+    @classmethod
+    def of(cls, degree: int, x: Array, y: Array, levels: Array, sigma: float) -> Curve:
+        """`degree` of the polynomial, 1 at least; x (N, D), D may be 0."""
+        low, high = (float(x[:, 0].min()), float(x[:, 0].max())) if x.shape[1] else (0.0, 1.0)
+        columns = _powers(x, low, high, degree)
+        beta = np.linalg.lstsq(np.column_stack([levels, x, columns]), y, rcond=None)[0][levels.shape[1] :]
+        return cls(
+            x, columns, sigma, low, high, np.asarray(beta[: x.shape[1]], float), np.asarray(beta[x.shape[1] :], float)
+        )
+
+    def __call__(self, x: Array) -> Array:
+        """The function at features (n, D), but for the run's level."""
+        powers = _powers(x, self.low, self.high, len(self.weights) + 1)
+        return np.asarray(x @ self.slope + powers @ self.weights)
+
+
+def _powers(x: Array, low: float, high: float, degree: int) -> Array:
+    """Legendre polynomials of degree 2 and more of the first feature (n, degree − 1), none without features."""
+    if x.shape[1] == 0:
+        return np.zeros((len(x), 0))
+    return np.asarray(
+        np.polynomial.legendre.legvander((2.0 * x[:, 0] - low - high) / (high - low), degree)[:, 2:], float
+    )
