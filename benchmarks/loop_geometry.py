@@ -7,6 +7,9 @@ are in sigma: the Cramér–Rao bound of the effect with all other candidates es
 parameters get a random direction of that size. Printed: false alarms of clean lines, with the one-sided 95 % bound; at 4 and 8
 sigma how often an effect is found, by its name or in its family, and how far off in sigma (RMS; the estimated sigma over the
 bound); with the effect out of the library (at 8 and 30 sigma), how often a wrong name is forced, and what is answered.
+
+Measured: clean, 2 of 60 name something (≤ .10). Out of the library, 3 trials at 8 and at 30 sigma each: a distortion at 30
+sigma is taken for focal length in all 3, whose signature is a straight line in the radius; no other gets a wrong name.
 """
 
 from __future__ import annotations

@@ -207,7 +207,7 @@ class LineRows:
         row, col = (poses or self.poses(geometry)).pixels(at, geometry.camera, point)
         return np.stack([gcps.row - row, gcps.col - col], -1)
 
-    def residual(self, geometry: Geometry, error: Offset | None = None, raised: float = 0.0) -> Array:
+    def residual(self, geometry: Geometry, error: Offset | None = None, raised: Array | float = 0.0) -> Array:
         """Seen minus predicted (n,): picks' rows, columns; pairs' modes of rows, of columns; heights."""
         poses = self.poses(geometry, error)
         picks = self.picks(geometry, poses)
@@ -266,8 +266,12 @@ class LineRows:
             columns += [self.settings.motion_bias_px * (moving & (series == one)) for one in np.unique(series[moving])]
             if self.dem is None:
                 relief = max(float(np.std(self.points[:, 2])), UNEVEN_M)
-                raised = self.residual(self.null, raised=relief) - self.residual(self.null)
-                columns += [raised, *(raised * (frame == one) for one in np.unique(frame[moving]))]
+                null, camera = self.residual(self.null), self.null.camera
+                y = 2.0 * self.modes.points.row / camera.rows - 1.0
+                x = 2.0 * self.modes.points.col / camera.cols - 1.0
+                for a, b in DEGREES:
+                    hills = self.residual(self.null, raised=relief * y**a * x**b) - null
+                    columns += [hills * (frame == one) for one in np.unique(frame[moving])]
         return np.stack(columns, -1).astype(float)
 
     def _columns(self, errors: Sequence[Offset]) -> Array:

@@ -106,10 +106,10 @@ def grounded(
     return Points(first, second, *pixel, rest, rest, ground, normal, -axes[:, :, 2])
 
 
-def missed(points: Points, poses: Poses, camera: Camera, raised: float = 0.0) -> tuple[Array, Array]:
-    """Shift seen minus shift predicted (n,) of row and column, over terrain that lies `raised` [m] higher."""
+def missed(points: Points, poses: Poses, camera: Camera, raised: Array | float = 0.0) -> tuple[Array, Array]:
+    """Shift seen minus shift predicted (n,) of row and column, over terrain that lies `raised` [m] (n,) higher."""
     start, ray = poses.rays(points.first, camera, points.row, points.col)
-    away = points.ground + raised * points.up - start
+    away = points.ground + np.asarray(raised)[..., None] * points.up - start
     along = np.einsum("pi,pi->p", points.normal, away) / np.einsum("pi,pi->p", points.normal, ray)
     row, col = poses.pixels(points.second, camera, start + along[:, None] * ray)
     return points.row + points.row_shift - row, points.col + points.col_shift - col
