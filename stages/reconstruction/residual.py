@@ -5,7 +5,7 @@
 d is the mean over the pixels inside a panel (`panel_pixels`) in one detector column, each after dark and divided by its flat;
 level a polynomial in the column, one for each interferogram; φ one polynomial in σ for the whole campaign. Level and φ are
 estimated anew at every set of parameters, so that what is linearised about is always near. The non-linearity acts on the model:
-data made linear would carry their own noise into the signature (measured: a spline of the signal beat the name in 2 of 6).
+data made linear would carry their own noise into the signature (measured: a spline of the signal beat the name in 1 of 2 runs).
 
 A scale that panels have one by one (dirt, a panel lit askew) is none of the candidates: it makes `response_scale` change from
 group to group, which the loop reports as structure without a name. One that all references share is `response_scale` itself.
@@ -201,7 +201,7 @@ class Model:
     @cached_property
     def step(self) -> Array:
         """(order + 1, n): what a residual says of the phase, at the null."""
-        return np.linalg.pinv(self.cleared(self.phase_columns()))
+        return np.asarray(np.linalg.pinv(self.cleared(self.phase_columns())), float)
 
     def fitted(self, parameters: Parameters, turns: int) -> tuple[Array, Array, Array]:
         """Phase, level and r (n,) with both fitted, by steps with the derivatives at the null: what they leave lies along the
