@@ -103,20 +103,23 @@ class Innovations:
         return made.residual
 
     def at(self, at: Array) -> Linearisation:
-        """The filter, run at θ."""
+        """The filter, run at θ; a fix that a latency carries into a gap of the inertial data says nothing there: zero."""
         theta = self.null.theta.copy()
         for (effect, name), value in zip(self.order, at, strict=True):
             theta[states.parameter(effect).start + list(EFFECTS[effect].units).index(name)] += value
         problem = replace(self.null, theta=theta, latency=float(theta[states.parameter("gnss_latency")][0]))
-        gathered, _, count, store = forward(problem, DECIDED_HERE, self.refused)
-        active = states.estimated({*problem.settings.estimate, *DECIDED_HERE})
+        gathered, _, count, store = forward(problem, CANDIDATES, self.refused)
+        active = states.estimated({*problem.settings.estimate, *CANDIDATES})
         begun = np.zeros((active.size, len(self.order)))
         for column, (effect, name) in enumerate(self.order):
             place = states.GROUPS[effect].start + list(EFFECTS[effect].units).index(name)
             begun[np.searchsorted(active, place), column] = 1.0
         fixes = gathered.of_fix[self.chosen]
         m = int(gathered.measurements.size[fixes[0]])
-        root = _roots(store.S_inv[fixes, :m, :m])
+        weights = np.where(store.used[fixes, None, None], store.S_inv[fixes, :m, :m], np.eye(m))
+        if not (np.isfinite(weights).all() and np.isfinite(store.y[fixes]).all()):
+            return Linearisation(at, np.full(m * fixes.size, np.nan), np.full((m * fixes.size, at.size), np.nan))
+        root = _roots(weights)
         y = np.einsum("kij,kj->ik", root, store.y[fixes, :m])
 
         def signatures(jolts: Array) -> Array:

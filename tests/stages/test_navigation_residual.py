@@ -105,7 +105,17 @@ def test_what_the_settings_estimate_is_left_to_the_loop() -> None:
     settings = NavigationSettings(estimate=("gyro_bias", "accel_bias", "antenna_lever_arm", "gnss_latency"))
     p = residual_problem(imu, gnss, MEMS.model, Mounting(LEVER), settings, initial=initial)
     assert np.sqrt(np.mean(p.residual({}) ** 2)) > 1.05
-    assert p.residual({}).size == p.group.size
+    assert abs(np.sqrt(np.mean(at(p, **truth) ** 2)) - 1.0) < 0.05
+
+
+def test_fixes_around_a_gap() -> None:
+    """A gap of a second: fixes in it say nothing, with and without a latency; the rest stays white."""
+    imu, gnss, initial = recorded(MEMS, 0, 1, {})
+    whole = (imu.time < 60.1) | (imu.time > 61.1)
+    broken = replace(imu, time=imu.time[whole], gyro=imu.gyro[whole], accel=imu.accel[whole])
+    p = residual_problem(broken, gnss, MEMS.model, Mounting(LEVER), NavigationSettings(), initial=initial)
+    assert abs(np.sqrt(np.mean(p.residual({}) ** 2)) - 1.0) < 0.06
+    assert np.isfinite(p.residual({"gnss_latency": {"latency": 0.7}})).all()
 
 
 def test_outliers_and_withheld_fixes_are_left_out() -> None:
