@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flows.steps import Plan, compensation, initial_attitude, naming, of_camera, plain, turn_on
+from flows.steps import Plan, compensation, initial_attitude, naming, plain, turn_on
 from pipeline.errors import StageError
 from pipeline.raster import Dem
 from pipeline.records import Tracks, Trajectory
@@ -203,13 +203,21 @@ def geometry_of(plan: Plan) -> dict[str, Any]:
                 frames.time,
                 campaign.gcps(flight, line),
                 campaign.targets(flight, line),
-                registration.image_motion(frames, camera, plan.settings.registration, of_camera(plan)),
+                registration.image_motion(frames, camera, plan.settings.registration),
                 campaign.imu(flight).temperatures,
                 flight,
             )
         )
     dem = None if campaign.keys.dem is None else Dem.from_file(campaign.path(campaign.keys.dem))
-    return {"lines": lines, "camera": camera, "mounting": mounting, "dem": dem, "effects": plan.effects("geometry")}
+    gyro = None if campaign.instrument.imu is None else campaign.instrument.imu.gyro
+    return {
+        "lines": lines,
+        "camera": camera,
+        "mounting": mounting,
+        "dem": dem,
+        "effects": plan.effects("geometry"),
+        "gyro": gyro,
+    }
 
 
 def _geometry(plan: Plan) -> ResidualProblem:
