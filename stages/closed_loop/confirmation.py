@@ -2,9 +2,10 @@
 
     ΔRMS = 1 − RMS_after/RMS_before,      ΔL = Σ_groups [ln p(r_g | fit without g, after) − ln p(r_g | …, before)]
 
-In each fold the best of the library is chosen anew from the training groups; so the gain is that of the whole procedure, not of
-the name that all the data chose. Columns that only the held-out group has (its own level, say) are fitted there, before and
-after alike. Each side has its own noise, by REML from the training part.
+In each fold the best of the library is chosen anew from the training groups, and what the residual is not linear in is estimated
+from them; so the gain is that of the whole procedure, not of the name and the values that all the data chose. Columns that only
+the held-out group has (its own level, say) are fitted there, before and after alike. Each side has its own noise, by REML from
+the training part.
 
 Functions
 ---------
@@ -15,7 +16,7 @@ held_out     RMS and log-likelihood of one group
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -126,9 +127,11 @@ def confirm(
     chosen: int,
     refined: Model,
     noise: Noise,
+    refine: Callable[[Index, int], Model] | None = None,
 ) -> Confirmation:
     """`library`: what each member would make of the model (its columns are before's and its own); `families`: their effects;
-    `refined`: the chosen one's, linearised where it converged."""
+    `refined`: the chosen one's, linearised where it converged; `refine`: the same from training samples and the member that they
+    choose, where the residual is not linear in it."""
     spread = channel_spread(problem, rows, refined, noise)
     touched = _touched(problem, refined.term)
     totals = np.zeros(2)
@@ -150,12 +153,18 @@ def confirm(
         if not wanted:  # another one comes first, and this one is needed beside it: two effects at once
             value, rank = statistic(project(projected, where[best]), where[chosen])
             wanted = rank > 0 and log_tail(value, rank) < np.log(NEEDED / len(library))
-        model = refined if wanted else library[best]
+        model = (
+            library[best]
+            if not wanted
+            else refined
+            if refine is None
+            else refine(train, _own_best(scores, families, chosen))
+        )
         agree += wanted
         e0, l0, _ = held_out(problem, train, held, before, noise)
         e1, l1, beta = held_out(problem, train, held, model, noise)
-        if model is refined and refined.term.size:
-            term = refined.term + refined.columns[:, refined.added] @ beta[list(refined.added)]
+        if wanted and refined.term.size:
+            term = model.term + model.columns[:, model.added] @ beta[list(model.added)]
             same &= bool(term[rows] @ refined.term[rows] > 0.0)
         gains.append(l1 - l0)
         totals += [float(np.sum((e / spread[held])[touched[held]] ** 2)) for e in (e0, e1)]
@@ -172,6 +181,11 @@ def confirm(
         same and agree > 0,
         float(np.sum(gains) - np.max(gains)),
     )
+
+
+def _own_best(scores: Sequence[float], families: Sequence[str], chosen: int) -> int:
+    """The best member of the chosen one's family."""
+    return min((k for k, name in enumerate(families) if name == families[chosen]), key=lambda k: scores[k])
 
 
 def _touched(problem: ResidualProblem, term: Array) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ reported (`learned:<covariate>`), never the name that fits a little.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from scipy.special import chdtrc
 from pipeline.residual_problem import Basis, Candidate, ResidualProblem
 from stages.closed_loop import confirmation, identifiability, learned
 from stages.closed_loop.confirmation import Confirmation, Model
-from stages.closed_loop.estimation import Estimate, estimate
+from stages.closed_loop.estimation import Estimate, descend, estimate
 from stages.closed_loop.noise import Layout, Noise, fit_noise, gram
 from stages.closed_loop.result import Considered, LoopResult, Pictures, Sealed, Step, Value, Verdict
 from stages.closed_loop.score_test import Finding, project, search, solve, spans, statistic
@@ -187,7 +187,9 @@ def _named_step(
         found = _members(problem, state, candidates)
         columns, data = state.columns, state.residual
         signatures = [m.columns[rows] for m in found]
-        finding, state.noise = search(layout, columns[rows], signatures, data[rows], state.noise, settings.draws, rng)
+        finding, state.noise = search(
+            layout, columns[rows], signatures, data[rows], state.noise, settings.draws, rng, [m.effect for m in found]
+        )
         if finding is None or finding.p > settings.p_value:
             return False
         member = found[finding.index]
@@ -250,7 +252,12 @@ def _examine(
     own = tuple(state.nuisance.shape[1] + c for c in estimated.columns(member.effect))
     refined = Model(estimated.residual, np.column_stack([state.nuisance, estimated.signatures]), added=own, term=term)
     families = [m.effect if m.effect not in rivals else member.effect for m in found]
-    checked = confirmation.confirm(problem, rows, before, library, families, finding.index, refined, finding.noise)
+    refine = None
+    if candidates[member.effect].grid:
+        refine = _refiner(problem, state, candidates, found, before, finding.noise)
+    checked = confirmation.confirm(
+        problem, rows, before, library, families, finding.index, refined, finding.noise, refine
+    )
     if not checked.passes(settings.gain, settings.decisive):
         return Refusal(_why_not(checked), _repeats(checked))
     tests = f"largest of {len(found)} tests, {_noise_text(problem, finding.noise)}"
@@ -262,6 +269,30 @@ def _examine(
         problem.stage, member.effect, {}, evidence, tuple(rivals), checked.before, checked.after, finding.p
     )  # fmt: skip
     return estimated, record
+
+
+def _refiner(
+    problem: ResidualProblem,
+    state: State,
+    candidates: Mapping[str, Candidate],
+    found: Sequence[Member],
+    before: Model,
+    noise: Noise,
+) -> Callable[[Index, int], Model]:
+    """(training samples, member) → the model that the effect has by these samples alone."""
+
+    def refine(train: Index, index: int) -> Model:
+        layout, member = Layout.of(problem, train), found[index]
+        p = before.columns.shape[1]
+        m = gram(layout, noise, np.column_stack([before.columns, member.columns, before.data])[train])
+        amplitude, _ = solve(project(m, slice(0, p)), range(p, p + member.columns.shape[1]))
+        values = merged(state.values, member.effect, member.start(amplitude))
+        e = descend(problem, layout, state.nuisance, values, candidates, noise, rounds=1)
+        own = tuple(state.nuisance.shape[1] + c for c in e.columns(member.effect))
+        columns = np.column_stack([state.nuisance, e.signatures])
+        return Model(e.residual, columns, added=own, term=before.data - e.residual)
+
+    return refine
 
 
 def _beside(
@@ -345,9 +376,8 @@ def _better_covariate(
             continue
         off = [*range(p), *range(p + 1, h), *range(h, h + q)]
         value, rank = statistic(project(m, off), [p])
-        if not rank:  # the term is a curve of this covariate, and the curve is another one
-            continue
-        if float(chdtrc(rank, value)) > UNNEEDED:
+        # Without rank the term is itself a curve of this covariate, and the data ask for another one.
+        if not rank or float(chdtrc(rank, value)) > UNNEEDED:
             winner, lowest = name, p_spline
     return winner
 

@@ -60,11 +60,11 @@ def estimate(
     Far from the minimum the misfit itself looks like coloured noise, in which the descent can come to rest: where plain least
     squares would leave much less, it is begun again from there, and the likelier of both is the answer.
     """
-    found = _descend(problem, layout, nuisance, values, candidates, noise)
+    found = descend(problem, layout, nuisance, values, candidates, noise)
     if not _rests_early(layout, nuisance, found):
         return found
-    plain = _descend(problem, layout, nuisance, found.values, candidates, whitened(noise), rounds=1)
-    other = _descend(problem, layout, nuisance, plain.values, candidates, plain.noise)
+    plain = descend(problem, layout, nuisance, found.values, candidates, whitened(noise), rounds=1)
+    other = descend(problem, layout, nuisance, plain.values, candidates, plain.noise)
     both = [
         deviance(layout, e.noise, np.column_stack([nuisance, e.signatures])[layout.rows], e.residual[layout.rows])
         for e in (found, other)
@@ -87,7 +87,7 @@ def _rests_early(layout: Layout, nuisance: Array, found: Estimate) -> bool:
     return left(np.column_stack([n, s])) < EARLY * left(n)
 
 
-def _descend(
+def descend(
     problem: ResidualProblem,
     layout: Layout,
     nuisance: Array,
@@ -184,4 +184,4 @@ def without(values: Values, effect: str) -> Values:
     return {name: dict(parameters) for name, parameters in values.items() if name != effect}
 
 
-__all__ = ["Estimate", "estimate", "merged", "without"]
+__all__ = ["Estimate", "descend", "estimate", "merged", "without"]

@@ -6,8 +6,9 @@ Of the Gram matrix M = C'K⁻¹C of C = [N | S₁ | S₂ | … | r], with N proj
 
 K is fitted by REML with the member in the model: an effect that is there must not count as noise. The p-value of a member is
 the mean of P(χ²_q > χ²_k(K_m)) over noise K_m drawn from its restricted likelihood, which is the F-test where the noise is
-white. Family-wise: the share of draws u ~ N(0, S'K⁻¹S) in which the smallest p of the library is below it, or the number of
-members times it (Bonferroni's bound), whichever is smaller.
+white. An effect that makes n tests (a grid) pays for them itself: its p-values count n times, so that effects of one test do not
+lose power to it. Family-wise: the share of draws u ~ N(0, S'K⁻¹S) in which the smallest n·p of the library is below it, or the
+number of effects times it (Bonferroni's bound), whichever is smaller.
 
 Functions
 ---------
@@ -38,7 +39,7 @@ NOWHERE_NEAR = 0.3  # family-wise p at both first looks, beyond which there is n
 
 @dataclass(frozen=True)
 class Finding:
-    """The best member: index, p family-wise, log of its own p, χ² and rank, and the noise with it in the model."""
+    """The best member: index, p family-wise, log of its effect's p, χ² and rank, and the noise with it in the model."""
 
     index: int
     p: float
@@ -103,9 +104,13 @@ def search(
     start: Noise | None,
     draws: int,
     rng: np.random.Generator,
+    effects: Sequence[str] | None = None,
 ) -> tuple[Finding | None, Noise]:
     """The most significant of `signatures` [(rows, q), …] in `residual` (rows,) beside `nuisance` (rows, p), and the noise
-    without any of them; no finding where no signature is left beside the nuisance."""
+    without any of them; no finding where no signature is left beside the nuisance. `effects`: whose signature each is (default:
+    all of different ones)."""
+    named = list(effects) if effects is not None else [str(i) for i in range(len(signatures))]
+    log_tests = np.log([named.count(one) for one in named])
     everything = np.column_stack([nuisance, *signatures, residual])
     p = nuisance.shape[1]
     where = spans([s.shape[1] for s in signatures], p)
@@ -117,10 +122,13 @@ def search(
     lowest = 1.0
     for noise in (null, fit_noise(layout, np.column_stack([nuisance, *signatures]), residual, null)):
         projected = project(gram(layout, noise, everything), slice(0, p))
-        log_p = _log_p(projected, where)
+        log_p = _log_p(projected, where) + log_tests
         good = [int(k) for k in np.argsort(log_p)[:LOOKED_AT] if np.isfinite(log_p[k])]
         if good:
-            lowest = min(lowest, family_wise(projected[p:-1, p:-1], spans(sizes, 0), float(log_p[good[0]]), draws, rng))
+            lowest = min(
+                lowest,
+                family_wise(projected[p:-1, p:-1], spans(sizes, 0), float(log_p[good[0]]), draws, rng, log_tests),
+            )
         order += good
     if not order:
         return None, null
@@ -136,13 +144,13 @@ def search(
         for one in noise_draws(layout, with_k, residual, noise, NOISE_DRAWS, rng):
             value, rank = statistic(project(gram(layout, one, narrow), slice(0, p)), own)
             logs.append(log_tail(value, rank) if rank else 0.0)
-        log_p_k = float(logsumexp(logs) - np.log(len(logs)))
+        log_p_k = float(logsumexp(logs) - np.log(len(logs)) + log_tests[k])
         if best is None or log_p_k < best.log_p:
             value, rank = statistic(project(gram(layout, noise, narrow), slice(0, p)), own)
             best = Finding(k, 1.0, log_p_k, value, rank, noise)
     assert best is not None
     projected = project(gram(layout, best.noise, everything), slice(0, p))
-    family = family_wise(projected[p:-1, p:-1], spans(sizes, 0), best.log_p, draws, rng)
+    family = family_wise(projected[p:-1, p:-1], spans(sizes, 0), best.log_p, draws, rng, log_tests)
     return Finding(best.index, family, best.log_p, best.chi2, best.rank, best.noise), null
 
 
@@ -155,21 +163,29 @@ def _log_p(projected: Array, where: Sequence[Sequence[int]]) -> Array:
 
 
 def family_wise(
-    information: Array, where: Sequence[Sequence[int]], log_p: float, draws: int, rng: np.random.Generator
+    information: Array,
+    where: Sequence[Sequence[int]],
+    log_p: float,
+    draws: int,
+    rng: np.random.Generator,
+    log_tests: Array | None = None,
 ) -> float:
-    """P(some member of the library has a smaller p) under the null, for score vectors u ~ N(0, information)."""
-    tested = [c for c in where if any(information[i, i] > 0.0 for i in c)]
-    bound = min(1.0, len(tested) * float(np.exp(log_p)))
+    """P(some member of the library has a smaller p) under the null, for score vectors u ~ N(0, information); `log_tests`
+    (members,): logarithm of how many times a member's p counts."""
+    weight = np.exp(np.zeros(len(where)) if log_tests is None else log_tests)
+    tested = [k for k, c in enumerate(where) if any(information[i, i] > 0.0 for i in c)]
+    bound = min(1.0, float(np.sum(1.0 / weight[tested])) * float(np.exp(log_p)))
     if bound < 1.0 / draws:
         return bound
     values, vectors = np.linalg.eigh(information)
     half = vectors * np.sqrt(np.maximum(values, 0.0))
     u = rng.standard_normal((draws, half.shape[1])) @ half.T
     reached = np.zeros(draws, bool)
-    for c in tested:
-        used = [i for i in c if information[i, i] > 0.0]
+    for k in tested:
+        used = [i for i in where[k] if information[i, i] > 0.0]
         inv, rank = inverse(information[np.ix_(used, used)])
-        reached |= np.einsum("di,ij,dj->d", u[:, used], inv, u[:, used]) >= chdtri(rank, np.exp(log_p))
+        limit = chdtri(rank, min(np.exp(log_p) / weight[k], 1.0))
+        reached |= np.einsum("di,ij,dj->d", u[:, used], inv, u[:, used]) >= limit
     return min(bound, (1.0 + np.count_nonzero(reached)) / (draws + 1.0))
 
 

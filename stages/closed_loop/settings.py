@@ -10,7 +10,7 @@ class LoopSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
-    p_value: float = Field(0.05, gt=0, lt=1)
+    p_value: float = Field(0.02, gt=0, lt=1)
     """Of the largest statistic over the whole library, below which an effect is looked at."""
     learned_p_value: float = Field(0.01, gt=0, lt=1)
     """The same for a curve of a covariate, which has no name to be checked against."""
