@@ -133,7 +133,7 @@ def confirm(
     `refined`: the chosen one's, linearised where it converged; `refine`: the same from training samples and the member that they
     choose, where the residual is not linear in it."""
     spread = channel_spread(problem, rows, refined, noise)
-    touched = _touched(problem, refined.term)
+    touched = _touched(problem, refined.columns[:, refined.added])
     totals = np.zeros(2)
     agree, same, gains = 0, True, []
     folds = [rows[f] for f in folds_of(problem.group[rows])]
@@ -188,12 +188,11 @@ def _own_best(scores: Sequence[float], families: Sequence[str], chosen: int) -> 
     return min((k for k, name in enumerate(families) if name == families[chosen]), key=lambda k: scores[k])
 
 
-def _touched(problem: ResidualProblem, term: Array) -> NDArray[np.bool_]:
-    """Samples (n,) of the channels that a term (n,) acts on: what it cannot change must not dilute its gain."""
-    every = np.ones(problem.group.size, bool)
-    if problem.channel is None or not term.any():
-        return every
-    acting = [one for one in np.unique(problem.channel) if term[problem.channel == one].any()]
+def _touched(problem: ResidualProblem, added: Array) -> NDArray[np.bool_]:
+    """Samples (n,) of the channels that some of the columns (n, k) act on: what they cannot change must not dilute their gain."""
+    if problem.channel is None:
+        return np.ones(problem.group.size, bool)
+    acting = [one for one in np.unique(problem.channel) if added[problem.channel == one].any()]
     return np.isin(problem.channel, acting)
 
 

@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 SEALED_FROM = 4  # groups
+LEARNED_TRIES = 6  # covariates looked at, the most significant first
+NESTED_FROM = 6  # groups; of fewer a training part may lack the very range that places a width or a lag
 CERTAIN = 1e-3  # family-wise p of structure that is there, though nothing accounts for it
 UNNEEDED = 0.05  # p of an effect beside others
 COVARIATE_WINS = 0.01
@@ -253,7 +255,7 @@ def _examine(
     refined = Model(estimated.residual, np.column_stack([state.nuisance, estimated.signatures]), added=own, term=term)
     families = [m.effect if m.effect not in rivals else member.effect for m in found]
     refine = None
-    if candidates[member.effect].grid:
+    if candidates[member.effect].grid and np.unique(problem.group[rows]).size >= NESTED_FROM:
         refine = _refiner(problem, state, candidates, found, before, finding.noise)
     checked = confirmation.confirm(
         problem, rows, before, library, families, finding.index, refined, finding.noise, refine
@@ -433,17 +435,32 @@ def _drop_unneeded(
 def _learned_step(
     problem: ResidualProblem, layout: Layout, state: State, settings: LoopSettings, rng: np.random.Generator
 ) -> bool:
-    """Add the spline of a covariate that explains what is left, if held-out error falls; False where none does."""
+    """Add the spline of a covariate that explains what is left, if held-out error falls; False where none does. One that stands
+    out and does not help leaves the next its turn."""
+    done = {s.effect.removeprefix("learned:") for s in state.steps if s.table is not None}
+    splines = _splines(problem, layout, settings.spline_columns)
+    splines = {name: s for name, s in splines.items() if name not in done}
+    if np.unique(problem.group[layout.rows]).size < 2:
+        return False
+    for _ in range(min(len(splines), LEARNED_TRIES)):
+        answer = _try_learned(problem, layout, state, splines, settings, rng)
+        if not isinstance(answer, str):
+            return answer
+        del splines[answer]
+    return False
+
+
+def _try_learned(
+    problem: ResidualProblem,
+    layout: Layout,
+    state: State,
+    splines: Mapping[str, Array],
+    settings: LoopSettings,
+    rng: np.random.Generator,
+) -> bool | str:
+    """Whether the most significant spline was added; its name where it stands out and is refused."""
     rows, columns, data = layout.rows, state.columns, state.residual
     p = columns.shape[1]
-    done = {s.effect for s in state.steps}
-    splines = {
-        name: s
-        for name, s in _splines(problem, layout, settings.spline_columns).items()
-        if f"learned:{name}" not in done
-    }
-    if not splines or np.unique(problem.group[rows]).size < 2:
-        return False
     names = list(splines)
     finding, state.noise = search(
         layout, columns[rows], [splines[n][rows] for n in names], data[rows], state.noise, settings.draws, rng
@@ -495,7 +512,7 @@ def _learned_step(
     state.notes.append(f"{name} stands out among covariates (p {_p_text(finding.p)}) but is not used: {problem_text}")
     if finding.p < CERTAIN and _repeats(checked) and confirmation.controls_fail(reached, valid):
         state.certain.append(f"learned:{name}")
-    return False
+    return name
 
 
 def _table(covariate: Array | Basis, term: Array, beta: Array) -> dict[str, list[float]]:
@@ -544,14 +561,14 @@ def _close(
             )
             state.certain.append(names)
             steps, values, rms_after = [], {}, rms_before
-    if problem.sigma is not None and not steps:
-        white = float(np.sqrt(np.mean([c.variance for c in noise])))
+    if problem.sigma is not None:
         rms = _rms(problem, layout, state)
         excess = (rms / problem.sigma) ** 2 * rows.size
         if rms > EXCESS * problem.sigma and chdtrc(rows.size - state.columns.shape[1], excess) < CERTAIN:
-            state.notes.append(
-                f"what is left is {rms / problem.sigma:.3g} times the declared sigma (its white part {white / problem.sigma:.3g})"
-            )
+            told = f"what is left is {rms / problem.sigma:.3g} times the declared sigma"
+            if steps:
+                told += ": something more is missing, or what was added stands for something else"
+            state.notes.append(told)
             state.certain.append("excess")
     families = [
         identifiability.Limit(

@@ -348,7 +348,7 @@ class _Builder:
             own["history"] = value[:, axis.number] - past[:, axis.number]
             own |= {name: f for name, f in zip(NAMES[2:], axis.features[:, 2:].T, strict=False)}
             for name, values in own.items():
-                wide = np.full((count, n), values.mean())
+                wide = np.full((count, n), np.nan)
                 wide[i] = values
                 out[f"{name} ({CHANNELS[axis.number]})"] = wide.ravel()
         return out
