@@ -89,15 +89,17 @@ def _cross(
         share[4, i] = _ONE / _gain(share[2, i], share[0, i], share[1, i])
     pixel, out = frames.reshape(-1), sums.reshape(-1)
     for i in range(c0.size):
-        n = int(crossed[i])
-        if n == 0:
-            continue
-        u, v, t = share[0, i], share[1, i], share[2, i]
+        u, v, t, step, weight = share[0, i], share[1, i], share[2, i], share[3, i], share[4, i]
         # Unsigned: a negative index would be looked for at every access.
         a, b = np.uint64(place[0, i]), np.uint64(place[1, i])
         o = np.uint64((i * cols + place[2, i]) * channels)
-        weight = share[4, i]
-        while True:
+        for m in range(crossed[i]):
+            if m > 0:
+                t += step
+                weight = _ONE / _gain(t, u, v)
+                a += np.uint64(1)
+                b += np.uint64(1)
+                o += np.uint64(channels)
             before = pixel[a] + u * (pixel[a + np.uint64(plane)] - pixel[a])
             after = pixel[b] + v * (pixel[b + np.uint64(plane)] - pixel[b])
             value = before + t * (after - before)
@@ -107,14 +109,6 @@ def _cross(
                 if channels > 2:
                     out[o + np.uint64(2)] += weight * (r0[i] + t * (r1[i] - r0[i]))
                     out[o + np.uint64(3)] += 1.0
-            n -= 1
-            if n == 0:
-                break
-            a += np.uint64(1)
-            b += np.uint64(1)
-            o += np.uint64(channels)
-            t += share[3, i]
-            weight = _ONE / _gain(t, u, v)
 
 
 @numba.njit(cache=True, nogil=True)
