@@ -384,9 +384,11 @@ def _area(
         how = line.settings.extraction
         gain = gain_of(tracks.row[m, t], tracks.col[m, t], share, ifg.crossings[m, t], line.rows, line.breaks, how)
         at, w = (opd, window) if opd.ndim == 1 else (opd[m, t, chosen].mean(axis=0), window[m, t, chosen].mean(axis=0))
-        row, col = (np.insert(track[m, t], line.breaks, np.nan, axis=1) for track in (tracks.row, tracks.col))
-        outside = read_outside(row, col, share, ifg.value.shape[-1], line.blur)
-        mean_variance = variance[m, t, chosen].mean(axis=0) * gain + variance_of_outside(outside, grounds[t])
+        mean_variance = variance[m, t, chosen].mean(axis=0) * gain
+        if how == "between-frames":
+            row, col = (np.insert(track[m, t], line.breaks, np.nan, axis=1) for track in (tracks.row, tracks.col))
+            outside = read_outside(row, col, share, gain.size, line.blur)
+            mean_variance += variance_of_outside(outside, grounds[t])
         _, sigma[m, t] = fourier.radiance(mean_variance, at, w, line.scored, phi, response, mean_variance)
     return area, sigma
 
