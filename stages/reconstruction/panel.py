@@ -70,12 +70,13 @@ def panel_points(row: Array, col: Array) -> PanelPoints:
     return PanelPoints(carry @ row, carry @ col, np.stack([a, x], -1), half)
 
 
-def read_outside(row: Array, col: Array, share: Array, cols: int, blur: float) -> Array:
+def read_outside(row: Array, col: Array, share: Array, cols: int) -> Array:
     """Fraction (cols,) of the mean Σ share_p·I_p of an area's points that is read outside its panel.
 
     row, col (25, frame): tracks, NaN where nothing may be interpolated across. A sample lies between two frames, and in each its
     pixel lies (column − col) beside the point: where jitter carries a point several pixels in one frame, that is beyond the
-    edge for points half-way to it. A pixel is a box widened by the blur [px]; crossings of one column weigh the same.
+    edge for points half-way to it. A pixel is a box; the blur fitted to the edges holds these very steps and would count them
+    twice. Crossings of one column weigh the same.
     """
     seen = np.isfinite(row).all(axis=0) & np.isfinite(col).all(axis=0)
     if not seen.any():
@@ -85,11 +86,11 @@ def read_outside(row: Array, col: Array, share: Array, cols: int, blur: float) -
     fit = np.linalg.pinv(np.stack([np.ones_like(along), along, across], -1))[1:]
     slope = np.stack([(fit @ row[:, seen]).mean(axis=1), (fit @ col[:, seen]).mean(axis=1)])
     beside = np.linalg.pinv(slope)[:, 1]  # half sides a column
-    width = np.sqrt(1.0 / 12.0 + blur**2) / np.maximum(np.linalg.norm(slope, axis=0), 0.1)
+    h = 0.5 / np.maximum(np.linalg.norm(slope, axis=0), 0.1)  # half a pixel
 
     def inside(point: Array, shift: Array) -> Array:
         at = np.stack([along[point], across[point]], -1) + shift[:, None] * beside
-        return np.prod(ndtr((1.0 + at) / width) - ndtr((at - 1.0) / width), axis=1)
+        return np.prod(np.clip(np.minimum(at + h, 1.0) - np.maximum(at - h, -1.0), 0.0, None) / (2.0 * h), axis=1)
 
     before, after = col[:, :-1], col[:, 1:]
     low = np.floor(np.maximum(np.fmin(before, after), -1.0))

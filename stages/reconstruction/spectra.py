@@ -387,7 +387,7 @@ def _area(
         mean_variance = variance[m, t, chosen].mean(axis=0) * gain
         if how == "between-frames":
             row, col = (np.insert(track[m, t], line.breaks, np.nan, axis=1) for track in (tracks.row, tracks.col))
-            outside = read_outside(row, col, share, gain.size, line.blur)
+            outside = read_outside(row, col, share, gain.size)
             mean_variance += variance_of_outside(outside, grounds[t])
         _, sigma[m, t] = fourier.radiance(mean_variance, at, w, line.scored, phi, response, mean_variance)
     return area, sigma

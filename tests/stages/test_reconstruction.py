@@ -310,7 +310,7 @@ def test_the_nearest_pixel_is_read_with_its_own_opd() -> None:
 
 def test_what_jitter_lets_be_read_beyond_the_edge_is_known() -> None:
     """Frames of a 10 px panel on brighter ground, pixels as boxes: the share of ground in the mean of the area's 25 points,
-    column by column, is what `read_outside` says of their tracks alone (a Gaussian for the box: 10 % of the largest)."""
+    column by column, is what `read_outside` says of their tracks alone (rows and weights of repeated crossings: 5 % of the largest)."""
     rng = np.random.default_rng(8)
     rows, cols, half, frames = 24, 64, 5.0, 130
     centre = -20.0 + np.cumsum(1.0 + 1.8 * rng.standard_normal(frames))
@@ -329,7 +329,7 @@ def test_what_jitter_lets_be_read_beyond_the_edge_is_known() -> None:
     along_tracks(block, 0, row, col, sums)
     assert (sums[..., 1] > 0.0).all()
     ground = (sums[..., 0] / sums[..., 1] - 1.0).mean(axis=0)
-    told = read_outside(row, col, np.full(25, 1.0 / 25.0), cols, 0.0)
+    told = read_outside(row, col, np.full(25, 1.0 / 25.0), cols)
     print("read outside", ground.max(), told.max(), np.abs(told - ground).max())
     assert ground.max() > 0.1 and np.median(ground) < 0.02
-    assert np.abs(told - ground).max() < 0.1 * ground.max()
+    assert np.abs(told - ground).max() < 0.05 * ground.max()
