@@ -45,14 +45,21 @@ def _gain(t: Any, u: Any, v: Any) -> Any:
     return q * q * ((_ONE - u) * (_ONE - u) + u * u) + t * t * ((_ONE - v) * (_ONE - v) + v * v)
 
 
+@numba.njit(inline="always")
+def _within(row: Any, col: Any, rows: int) -> Any:
+    """The column, NaN where the row is not on the detector."""
+    return col if (row >= 0.0) & (row <= rows - 1.0) else np.nan
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def _cross(
     frames: Any, k: int, r0: Any, c0: Any, r1: Any, c1: Any, crossed: Any, place: Any, share: Any, sums: Any
 ) -> None:
     """Add the columns that points (n,) cross between frames k−1 and k to their sums (n, cols, channels).
 
-    r0, c0, r1, c1 (n,): where they are in the two frames. crossed (n,), place (3, n), share (5, n) are workspace: all that is
-    arithmetic is done first, without branches, so that the compiler makes vector instructions of it.
+    r0, c0, r1, c1 (n,): where they are in the two frames, columns NaN where the row is off the detector (`_within`). crossed
+    (n,), place (3, n), share (5, n) are workspace: all that is arithmetic is done first, without branches, so that the compiler
+    makes vector instructions of it.
     """
     rows, count, cols = frames.shape
     channels = sums.shape[2]
@@ -64,33 +71,35 @@ def _cross(
         # The columns in the half-open (low, high]: one met exactly at a frame counts once.
         low = np.floor(max(min(a0, a1), -1.0))
         high = np.floor(min(max(a0, a1), cols - 1.0))
-        ra, rb = r0[i], r1[i]
-        inside = (ra >= 0.0) & (ra <= top) & (rb >= 0.0) & (rb <= top) & (abs(a1 - a0) < cols)
-        crossed[i] = np.int32(max(high - low, 0.0)) if inside else np.int32(0)
+        crossed[i] = np.int32(max(high - low, 0.0)) if abs(a1 - a0) < cols else np.int32(0)
         some += crossed[i]
+    if some == 0:  # the frames in which no point is on the detector end here
+        return
+    for i in range(c0.size):
+        a0, a1, ra, rb = c0[i], c1[i], r0[i], r1[i]
+        column = np.floor(max(min(a0, a1), -1.0)) + 1.0
         fa, fb = min(max(np.floor(ra), 0.0), top - 1.0), min(max(np.floor(rb), 0.0), top - 1.0)
         step = 1.0 / (a1 - a0)
-        u, v = np.float32(ra - fa), np.float32(rb - fb)
-        t = np.float32((low + 1.0 - a0) * step)
-        share[0, i], share[1, i], share[2, i], share[3, i] = u, v, t, np.float32(step)
-        share[4, i] = _ONE / _gain(t, u, v)
-        column = low + 1.0
+        share[0, i], share[1, i] = np.float32(ra - fa), np.float32(rb - fb)
+        share[2, i], share[3, i] = np.float32((column - a0) * step), np.float32(step)
         place[0, i] = np.int32(fa * plane + ((k - 1) * cols + column))
         place[1, i] = np.int32(fb * plane + (k * cols + column))
         place[2, i] = np.int32(column)
-    if some == 0:
-        return
+    for i in range(c0.size):  # alone, so that all of a vector's lanes are float32
+        share[4, i] = _ONE / _gain(share[2, i], share[0, i], share[1, i])
     pixel, out = frames.reshape(-1), sums.reshape(-1)
     for i in range(c0.size):
-        n = int(crossed[i])
-        if n == 0:
-            continue
-        u, v, t = share[0, i], share[1, i], share[2, i]
+        u, v, t, step, weight = share[0, i], share[1, i], share[2, i], share[3, i], share[4, i]
         # Unsigned: a negative index would be looked for at every access.
         a, b = np.uint64(place[0, i]), np.uint64(place[1, i])
         o = np.uint64((i * cols + place[2, i]) * channels)
-        weight = share[4, i]
-        while True:
+        for m in range(crossed[i]):
+            if m > 0:
+                t += step
+                weight = _ONE / _gain(t, u, v)
+                a += np.uint64(1)
+                b += np.uint64(1)
+                o += np.uint64(channels)
             before = pixel[a] + u * (pixel[a + np.uint64(plane)] - pixel[a])
             after = pixel[b] + v * (pixel[b + np.uint64(plane)] - pixel[b])
             value = before + t * (after - before)
@@ -100,14 +109,6 @@ def _cross(
                 if channels > 2:
                     out[o + np.uint64(2)] += weight * (r0[i] + t * (r1[i] - r0[i]))
                     out[o + np.uint64(3)] += 1.0
-            n -= 1
-            if n == 0:
-                break
-            a += np.uint64(1)
-            b += np.uint64(1)
-            o += np.uint64(channels)
-            t += share[3, i]
-            weight = _ONE / _gain(t, u, v)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -123,10 +124,14 @@ def along_tracks(frames: Any, first: int, row: Any, col: Any, sums: Any) -> None
         np.empty((5, points), np.float32),
     )
     r0, c0, r1, c1 = np.empty(points), np.empty(points), np.empty(points), np.empty(points)
-    for k in range(1, frames.shape[1]):
-        r0[:], c0[:] = row[:, first + k - 1], col[:, first + k - 1]
-        r1[:], c1[:] = row[:, first + k], col[:, first + k]
-        _cross(frames, k, r0, c0, r1, c1, crossed, place, share, sums)
+    for k in range(frames.shape[1]):
+        r0, r1 = r1, r0
+        c0, c1 = c1, c0
+        for i in range(points):
+            r1[i] = row[i, first + k]
+            c1[i] = _within(r1[i], col[i, first + k], frames.shape[0])
+        if k > 0:
+            _cross(frames, k, r0, c0, r1, c1, crossed, place, share, sums)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
@@ -157,7 +162,7 @@ def over_cells(
                 y = (yx * dx + yy * dy + yz * dz) / z
                 s = (1.0 + k1 * (x * x + y * y)) * scale
                 r1[i] = row0 + s * y
-                c1[i] = col0 - s * x if z > 0.0 else np.nan  # behind the camera
+                c1[i] = _within(r1[i], col0 - s * x if z > 0.0 else np.nan, frames.shape[0])  # NaN behind the camera
             if k > 0:
                 _cross(frames, k, r0, c0, r1, c1, crossed, place, share, sums[j])
 

@@ -28,7 +28,7 @@ from tsmftis.interferometer import Interferometer
 Array = NDArray[np.float64]
 
 STRIP_CELLS = 128  # along the track: whole tiles of the GeoTIFF
-PIECE_CELLS = 16  # across the track, given to a thread at a time
+PIECE_CELLS = 2  # across the track, given to a thread at a time: their sums stay in its cache
 BLOCK_FRAMES = 128  # corrected at a time
 
 

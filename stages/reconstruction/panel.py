@@ -8,6 +8,9 @@ With f the fraction of a point's response outside the panel, c the contrast of t
 mean Σ w·I with Σ w = 1 that has the least variance plus squared bias, s²·Σ w² + c²·(Σ w·f)², is
 
     w ∝ 1 − f·c²·Σf/(s² + c²·Σf²),   points of negative weight left out in turn.
+
+The mean of the scored area takes its 25 points as they are; what of it jitter lets be read beyond the edge goes into its sigma
+(`read_outside`, `variance_of_outside`).
 """
 
 from __future__ import annotations
@@ -65,6 +68,64 @@ def panel_points(row: Array, col: Array) -> PanelPoints:
     a, x = (g.ravel() for g in np.meshgrid(*sides, indexing="ij"))
     carry = _quadratic(a / half[0], x / half[1]) @ fit
     return PanelPoints(carry @ row, carry @ col, np.stack([a, x], -1), half)
+
+
+def read_outside(row: Array, col: Array, share: Array, cols: int) -> Array:
+    """Fraction (cols,) of the mean Σ share_p·I_p of an area's points that is read outside its panel.
+
+    row, col (25, frame): tracks, NaN where nothing may be interpolated across. A sample lies between two frames, and in each its
+    pixel lies (column − col) beside the point: where jitter carries a point several pixels in one frame, that is beyond the
+    edge for points half-way to it. A pixel is a box; the blur fitted to the edges holds these very steps and would count them
+    twice. Crossings of one column weigh the same.
+    """
+    seen = np.isfinite(row).all(axis=0) & np.isfinite(col).all(axis=0)
+    if not seen.any():
+        return np.zeros(cols)
+    unit = np.linspace(-0.5, 0.5, Tracks.GRID)
+    along, across = (g.ravel() for g in np.meshgrid(unit, unit, indexing="ij"))
+    fit = np.linalg.pinv(np.stack([np.ones_like(along), along, across], -1))[1:]
+    slope = np.stack([(fit @ row[:, seen]).mean(axis=1), (fit @ col[:, seen]).mean(axis=1)])
+    beside = np.linalg.pinv(slope)[:, 1]  # half sides a column
+    h = 0.5 / np.maximum(np.linalg.norm(slope, axis=0), 0.1)  # half a pixel
+
+    def inside(point: Array, shift: Array) -> Array:
+        at = np.stack([along[point], across[point]], -1) + shift[:, None] * beside
+        return np.prod(np.clip(np.minimum(at + h, 1.0) - np.maximum(at - h, -1.0), 0.0, None) / (2.0 * h), axis=1)
+
+    before, after = col[:, :-1], col[:, 1:]
+    low = np.floor(np.maximum(np.fmin(before, after), -1.0))
+    number = np.floor(np.minimum(np.fmax(before, after), cols - 1.0)) - low
+    crossed = (number > 0) & (np.abs(after - before) < cols) & (share[:, None] > 0.0)
+    point, frame = np.nonzero(crossed)
+    times = number[crossed].astype(int)
+    point, frame = np.repeat(point, times), np.repeat(frame, times)
+    first = np.repeat(np.cumsum(times) - times, times)
+    column = low[point, frame] + 1.0 + np.arange(point.size) - first
+    start, end = before[point, frame], after[point, frame]
+    t = (column - start) / (end - start)
+    outside = 1.0 - (1.0 - t) * inside(point, column - start) - t * inside(point, column - end)
+    sample = point * cols + column.astype(int)
+    sums, counts = (np.bincount(sample, w, row.shape[0] * cols).reshape(-1, cols) for w in (outside, np.ones_like(t)))
+    return np.asarray(share @ (sums / np.maximum(counts, 1.0)))
+
+
+def ground_less_panel(points: PanelPoints, extracted: Extracted, blur: float) -> Array:
+    """Interferograms (point, col) [DN] of the points around a panel, less the panel's own; none where either was not seen."""
+    inside = points.inside(blur)
+    panel, ground = (extracted.counted & which for which in (inside > 0.98, inside < 0.02))
+    if not (panel.any() and ground.any()):
+        return np.empty((0, extracted.value.shape[1]))
+    return np.asarray(extracted.value[ground] - extracted.value[panel].mean(axis=0))
+
+
+def variance_of_outside(outside: Array, ground: Array) -> Array:
+    """Variance (col,) [DN²] of what a mean reads outside its panel: of outside·ground over the points of `ground` (point, col).
+
+    A constant, which the spectrum does not see, is left out; without ground, none."""
+    if not len(ground):
+        return np.zeros_like(outside)
+    error = outside * ground
+    return np.asarray(((error - error.mean(axis=1, keepdims=True)) ** 2).mean(axis=0))
 
 
 def _quadratic(a: Array, x: Array) -> Array:

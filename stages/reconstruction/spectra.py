@@ -14,7 +14,15 @@ from pipeline.errors import StageError
 from pipeline.records import Calibration, Frames, Interferograms, Products, References, Spectra, Targets, Tracks
 from pipeline.usable_pixels import unusable
 from stages.reconstruction.interferograms import Extracted, Extraction, extract, gain_of
-from stages.reconstruction.panel import PanelPoints, fitted_blur, pair_noise, panel_points
+from stages.reconstruction.panel import (
+    PanelPoints,
+    fitted_blur,
+    ground_less_panel,
+    pair_noise,
+    panel_points,
+    read_outside,
+    variance_of_outside,
+)
 from stages.reconstruction.products import PhaseCorrection, imaginary_residue, panel_levels, panel_mean, spectra_by
 from tsmftis import detector, fourier
 from tsmftis.camera import Camera
@@ -138,7 +146,8 @@ def run(
     )
     breaks = [start for start, _ in frames.segments()[1:]]
     line = _Line(calibration, interferometer, settings, phase, noise, wavenumber, camera.rows, breaks, blur)
-    spectra = _scored(ifg, ac, opd, tracks, counted, references, targets, line)
+    grounds = [ground_less_panel(p, extracted, blur) for p, extracted in zip(panels, of_panels, strict=True)]
+    spectra = _scored(ifg, ac, opd, tracks, counted, grounds, references, targets, line)
     products = _products(ifg, ac, opd, spectra, leading, panels, of_panels, references, targets, line)
     return ReconstructionResult(spectra, products, ifg, phase, *noise, int(bad.sum()))
 
@@ -189,6 +198,7 @@ def _scored(
     opd: Array,
     tracks: Tracks,
     counted: NDArray[np.bool_],
+    grounds: list[Array],
     references: References | None,
     targets: Targets,
     line: _Line,
@@ -200,7 +210,7 @@ def _scored(
     variance = line.variance(ifg.value)
     value, sigma = fourier.radiance(ac, opd, window, wavenumber, phi, response, variance * ifg.gain)
     value[~counted], sigma[~counted] = np.nan, np.nan
-    area, sigma_area = _area(ifg, tracks, value, variance, opd, window, phi, response, line)
+    area, sigma_area = _area(ifg, tracks, value, variance, opd, window, phi, response, grounds, line)
     centre = Tracks.CENTRE
     return Spectra(
         tracks.methods,
@@ -360,10 +370,11 @@ def _area(
     window: Array,
     phi: Array,
     response: Array,
+    grounds: list[Array],
     line: _Line,
 ) -> tuple[Array, Array]:
-    """Mean spectrum of each area's counted points (those whose `value` is finite) and its sigma, in which the noise of pixels
-    that several points share is counted once."""
+    """Mean spectrum of each area's counted points (those whose `value` is finite) and its sigma: noise, that of pixels which
+    several points share counted once, and what is read beyond the panel's edge, of the ground (point, col) around each."""
     counted = np.isfinite(value[..., 0])
     area, sigma = np.full_like(value[:, :, 0], np.nan), np.full_like(value[:, :, 0], np.nan)
     for m, t in zip(*np.nonzero(counted.sum(axis=2) >= LEAST_POINTS), strict=True):
@@ -374,6 +385,10 @@ def _area(
         gain = gain_of(tracks.row[m, t], tracks.col[m, t], share, ifg.crossings[m, t], line.rows, line.breaks, how)
         at, w = (opd, window) if opd.ndim == 1 else (opd[m, t, chosen].mean(axis=0), window[m, t, chosen].mean(axis=0))
         mean_variance = variance[m, t, chosen].mean(axis=0) * gain
+        if how == "between-frames":
+            row, col = (np.insert(track[m, t], line.breaks, np.nan, axis=1) for track in (tracks.row, tracks.col))
+            outside = read_outside(row, col, share, gain.size)
+            mean_variance += variance_of_outside(outside, grounds[t])
         _, sigma[m, t] = fourier.radiance(mean_variance, at, w, line.scored, phi, response, mean_variance)
     return area, sigma
 
