@@ -99,13 +99,14 @@ def _learned(path: Path, given: Any) -> tuple[Mapping[str, Any], ...]:
         if not isinstance(one, dict) or set(one) != set(LEARNED):
             raise InputError(path, place, "is no learned term", f"it has {', '.join(LEARNED)}")
         table = one["table"]
-        columns = [table.get(k) if isinstance(table, dict) else None for k in ("covariate", "value")]
-        if (
-            not all(isinstance(c, list) and all(isinstance(v, int | float) for v in c) for c in columns)
-            or len({len(c or []) for c in columns}) != 1
-        ):
+        columns = list(table.values()) if isinstance(table, dict) else []
+        numbers = all(isinstance(c, list) and all(isinstance(v, int | float) for v in c) for c in columns)
+        if not numbers or len(columns) < 2 or "covariate" not in table or len({len(c) for c in columns}) != 1:
             raise InputError(
-                path, f"{place[:-1]}.table'", "is no table", "give covariate and value, lists of one length"
+                path,
+                f"{place[:-1]}.table'",
+                "is no table",
+                "give covariate and its curves, lists of numbers of one length",
             )
     return tuple(given)
 

@@ -222,7 +222,7 @@ def test_an_update_is_read_as_it_was_written(tmp_path: Path) -> None:
         (
             {},
             {"learned": [{"stage": "x", "covariate": "y", "unit": "1", "table": {"covariate": [1], "value": []}}]},
-            ("learned[0].table", "lists of one length"),
+            ("learned[0].table", "of one length"),
         ),
         ({}, {"colour": 1}, ("colour", "not known")),
     ],

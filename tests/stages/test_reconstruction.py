@@ -310,7 +310,8 @@ def test_the_nearest_pixel_is_read_with_its_own_opd() -> None:
 
 def test_what_jitter_lets_be_read_beyond_the_edge_is_known() -> None:
     """Frames of a 10 px panel on brighter ground, pixels as boxes: the share of ground in the mean of the area's 25 points,
-    column by column, is what `read_outside` says of their tracks alone (rows and weights of repeated crossings: 5 % of the largest)."""
+    column by column, is what `read_outside` says of their tracks alone, to 5 % of the largest (rows, and weights of repeated
+    crossings)."""
     rng = np.random.default_rng(8)
     rows, cols, half, frames = 24, 64, 5.0, 130
     centre = -20.0 + np.cumsum(1.0 + 1.8 * rng.standard_normal(frames))
