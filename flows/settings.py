@@ -19,7 +19,7 @@ from stages.navigation import NavigationSettings
 from stages.reconstruction import ReconstructionSettings
 from stages.registration import RegistrationSettings
 from stages.thermal import ThermalSettings
-from stages.tracking import TrackingSettings
+from stages.tracking import GeometrySettings, TrackingSettings
 
 
 class Settings(BaseModel):
@@ -30,6 +30,7 @@ class Settings(BaseModel):
     thermal: ThermalSettings = ThermalSettings()
     navigation: NavigationSettings = NavigationSettings()
     tracking: TrackingSettings = TrackingSettings()
+    geometry: GeometrySettings = GeometrySettings()
     registration: RegistrationSettings = RegistrationSettings()
     reconstruction: ReconstructionSettings = ReconstructionSettings()
     mapping: MappingSettings = MappingSettings()

@@ -163,7 +163,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         about["model_update"] = json.dumps(update, sort_keys=True)
     method = plan.settings.thermal.method
     if compensated := compensation(plan, flight) != "none":
-        inputs["model"] = _needed(model, "thermal")
+        inputs["model"] = needed(model, "thermal")
         outputs["correction"] = f"{flight}/thermal.nc"
 
     def work(to: Paths) -> dict[str, Any]:
@@ -225,7 +225,7 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
     trajectory = plan.out / flight / "trajectory.nc"
     effects = of_camera(plan)
     inputs = {
-        "trajectory": _needed(trajectory, "navigation"),
+        "trajectory": needed(trajectory, "navigation"),
         "frames": campaign.path(entry.frames),
         "targets": campaign.path(entry.targets),
     }
@@ -287,8 +287,8 @@ def registration_step(plan: Plan, flight: str, line: str) -> StageRecord:
     camera = campaign.instrument.camera
     assert camera is not None
     inputs = {
-        "tracks": _needed(folder / "pos_tracks.nc", "tracking"),
-        "poses": _needed(folder / "poses.nc", "tracking"),
+        "tracks": needed(folder / "pos_tracks.nc", "tracking"),
+        "poses": needed(folder / "poses.nc", "tracking"),
         "frames": campaign.path(campaign.line(flight, line).frames),
     }
 
@@ -329,7 +329,7 @@ def reconstruction_step(plan: Plan, flight: str, line: str) -> StageRecord:
     entry, instrument = campaign.line(flight, line), campaign.instrument
     folder = plan.out / flight / line
     inputs = {
-        "tracks": _needed(folder / "tracks.nc", "registration"),
+        "tracks": needed(folder / "tracks.nc", "registration"),
         "frames": campaign.path(entry.frames),
         "targets": campaign.path(entry.targets),
         "calibration": campaign.path(campaign.keys.calibration or ""),
@@ -400,8 +400,8 @@ def mapping_step(plan: Plan, flight: str, line: str) -> StageRecord:
     folder = plan.out / flight / line
     settings, effects = plan.settings.mapping, plan.effects("geometry", "spectral")
     inputs = {
-        "poses": _needed(folder / "poses.nc", "tracking"),
-        "spectra": _needed(folder / "spectra.nc", "reconstruction"),
+        "poses": needed(folder / "poses.nc", "tracking"),
+        "spectra": needed(folder / "spectra.nc", "reconstruction"),
         "frames": campaign.path(entry.frames),
         "calibration": campaign.path(campaign.keys.calibration or ""),
         "targets": campaign.path(entry.targets),
@@ -496,7 +496,7 @@ def scoring_step(plan: Plan, flight: str, line: str) -> StageRecord:
         f"{flight}/{line}",
         ("stages.scoring",),
         {},
-        {"spectra": _needed(spectra, "reconstruction"), "products": _needed(products, "reconstruction")},
+        {"spectra": needed(spectra, "reconstruction"), "products": needed(products, "reconstruction")},
         {"scores": f"{flight}/{line}/scores.json"},
         work,
         **plan.switches("scoring"),
@@ -532,7 +532,7 @@ def bench_step(plan: Plan, bench: str) -> StageRecord:
     )
 
 
-def _needed(path: Path, stage: str) -> Path:
+def needed(path: Path, stage: str) -> Path:
     if not path.exists():
         raise InputError(path, "file", "is not there", f"run stage {stage} first: `--from {stage}` or no stage option")
     return path

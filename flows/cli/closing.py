@@ -18,16 +18,6 @@ from pipeline.errors import InputError
 from pipeline.inspect import check_campaign
 from pipeline.run_stage import StageRecord
 
-FIGURES = {
-    "rqe_tracking_mean": "RQE, one point",
-    "rqe_area_tracking_mean": "RQE, area mean",
-    "geometry_residual_px": "picked points [px]",
-    "navigation_nis_mean": "NIS of the innovations",
-    "navigation_withheld_m": "withheld fixes, horizontal, vertical [m]",
-    "thermal_gyro_std_deg_per_h": "gyros in the chamber [°/h]",
-    "thermal_accel_std_ug": "accelerometers in the chamber [µg]",
-    "bench_relative_rms": "bench spectrum, relative RMS",
-}
 SAID = {
     "effects_added": "effects added",
     "no_effect": "no effect is missing, as far as these data show",
@@ -104,9 +94,6 @@ def _process(plan: Plan, seed: int, console: Console) -> bool:
             console.print(f"  {record.problem}", style="red", markup=False)
 
     closed = run_loop(plan, seed, say)
-    wrong = next((r.problem for r in closed.records if isinstance(r.problem, InputError)), None)
-    if wrong and not closed.content["parts"]:
-        raise wrong
     write_loop_page(closed.content, plan.out)
     print_loop(console, closed.content)
     return any(record.status == "failed" for record in closed.records)
@@ -114,8 +101,9 @@ def _process(plan: Plan, seed: int, console: Console) -> bool:
 
 def print_loop(console: Console, content: dict[str, Any]) -> None:
     """Verdict, what was added and why, what cannot be told, figures before and after."""
-    console.print(f"\n{content['campaign']}: {SAID[content['verdict']]}", style="bold", markup=False)
-    from pipeline.report.loop import values
+    partly = " (of the parts that could be looked at)" if content["not_examined"] else ""
+    console.print(f"\n{content['campaign']}: {SAID[content['verdict']]}{partly}", style="bold", markup=False)
+    from pipeline.report.loop import FIGURES, values
 
     for step in content["steps"]:
         of = f", bench {step['bench']}" if "bench" in step else ""
@@ -131,7 +119,7 @@ def print_loop(console: Console, content: dict[str, Any]) -> None:
     table = Table(show_edge=False, header_style="bold", pad_edge=False)
     for name in ("on held-out data", "before", "after"):
         table.add_column(name, justify="left" if name[0] == "o" else "right")
-    for key, label in FIGURES.items():
+    for key, label in FIGURES:
         if key in content["before"]:
             table.add_row(label, *(_figure(content[when][key]) for when in ("before", "after")))
     if table.row_count:

@@ -26,11 +26,11 @@ from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
 from flows.loop.examine import examine_step
-from flows.loop.held_out import held_out_step
-from flows.loop.problems import Part, parts_of
+from flows.loop.held_out import Answers, held_out_step
+from flows.loop.problems import NothingThere, Part, lines_of, parts_of
 from flows.results import assemble, write_run
-from flows.steps import Plan
-from pipeline.errors import TsmftisError
+from flows.steps import Plan, reaches
+from pipeline.errors import StageError, TsmftisError
 from pipeline.model_update import ModelUpdate, write_model_update
 from pipeline.run_stage import StageRecord, write_json
 from tsmftis import __version__
@@ -53,7 +53,19 @@ def examine(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
     try:
         return examine_step(root, plan, part, seed)
     except TsmftisError as error:
-        return StageRecord("loop", part.name, "failed", False, 0.0, "", {}, error)
+        status = "skipped" if isinstance(error, NothingThere) else "failed"
+        return StageRecord("loop", part.name, status, False, 0.0, "", {}, error)
+
+
+@task(name="held-out", cache_policy=NO_CACHE, persist_result=False)
+def hold_out(
+    root: Path, before: Plan, last: Plan, answers: Answers, runs: tuple[dict[str, Any], dict[str, Any]]
+) -> StageRecord:
+    """Figures on held-out data. Where they cannot be made, the answer stands without them."""
+    try:
+        return held_out_step(root, before, last, answers, runs)
+    except TsmftisError as error:
+        return StageRecord("loop", "held-out", "failed", False, 0.0, "", {}, error)
 
 
 @flow(name="close-loop", validate_parameters=False, persist_result=False)
@@ -67,11 +79,15 @@ def close_loop_flow(plan: Plan, seed: int) -> Closed:
     write_run(before, first := assemble(before, records))
     parts, missing = parts_of(before)
     update, answers = ModelUpdate(), {}
+    made = records
     for part in parts:
         now = replace(after, update=update) if update.effects else before
         if update.effects and part.needs is not None:
             _take_over(before.out, after.out)
-            records += _campaign(now, upto=part.needs)
+            records += (made := _campaign(now, upto=part.needs))
+        if failed := _failed(made, part):
+            missing[part.name] = f"the stage {failed} before it failed"
+            continue
         record = examine.submit(root, now, part, seed).result()
         if listener:
             listener(record)
@@ -80,21 +96,27 @@ def close_loop_flow(plan: Plan, seed: int) -> Closed:
             missing[part.name] = str(record.problem)
             continue
         answers[part.name] = record.summary
-        update = _with(update, part, record.summary, alone=[p for p in parts if p.stage == "spectral"] == [part])
+        update = _with(update, part, record.summary, alone=_is_all(before))
+    if not answers:
+        problem = next((record.problem for record in records if record.problem is not None), None)
+        raise problem or StageError("; ".join(f"{name}: {why}" for name, why in missing.items()))
     write_model_update(update, root / UPDATE)
-    second = first
+    second, last = first, before
     if update.effects or any(update.bench.values()):
         _take_over(before.out, after.out)
-        after = replace(after, update=update)
-        records += (done := _campaign(after))
-        write_run(after, second := assemble(after, done))
+        last = replace(after, update=update)
+        records += (done := _campaign(last))
+        write_run(last, second := assemble(last, done))
     elif after.out.exists():
         shutil.rmtree(after.out)  # of an earlier look that found something
-    held_out = held_out_step(root, after if second is not first else before, answers, (first, second))
-    records.append(held_out)
+    record = hold_out.submit(root, before, last, answers, (first, second)).result()
+    records.append(record)
     if listener:
-        listener(held_out)
-    return Closed(_content(plan, seed, answers, missing, first, second, held_out.summary), records)
+        listener(record)
+    if record.problem is not None:
+        missing["held-out figures"] = str(record.problem)
+    figures = record.summary or {"before": {}, "after": {}, "how": {}}
+    return Closed(_content(plan, seed, answers, missing, second is not first, figures), records)
 
 
 def run_loop(plan: Plan, seed: int, listener: Listener | None = None) -> Closed:
@@ -117,6 +139,16 @@ def _campaign(plan: Plan, upto: str | None = None) -> list[StageRecord]:
     graph = Graph(plan, upto)
     graph.campaign()
     return graph.results()
+
+
+def _failed(records: list[StageRecord], part: Part) -> str | None:
+    """A stage that the part needs and that was not done: what it left in earlier runs is not what these models make."""
+    return next((r.stage for r in records if part.needs and reaches(r.stage, part.needs) and r.status != "done"), None)
+
+
+def _is_all(plan: Plan) -> bool:
+    """Whether the campaign is one laboratory interferogram: its detector is then the instrument's."""
+    return not lines_of(plan) and len(plan.opened.keys.bench) == 1
 
 
 def _take_over(before: Path, after: Path) -> None:
@@ -161,8 +193,7 @@ def _content(
     seed: int,
     answers: dict[str, dict[str, Any]],
     missing: dict[str, str],
-    first: dict[str, Any],
-    second: dict[str, Any],
+    again: bool,
     held_out: dict[str, Any],
 ) -> dict[str, Any]:
     steps = [
@@ -190,6 +221,6 @@ def _content(
             "tsmftis": __version__,
             "seed": seed,
             "settings": plan.settings.model_dump(mode="json"),
-            "runs": {"before": f"{BEFORE}/run.json", "after": f"{AFTER if second is not first else BEFORE}/run.json"},
+            "runs": {"before": f"{BEFORE}/run.json", "after": f"{AFTER if again else BEFORE}/run.json"},
         },
     }

@@ -1,12 +1,14 @@
 """The engine on one part of a campaign, as a cached step: result as JSON, the residual's pictures as NetCDF.
 
-Beside the answer it keeps, for effects that were added, their parameters without some groups (`folds_of`): figures on held-out
-data are made with those.
+Beside the answer it keeps, for spectral effects that were added, their parameters without each half of the groups: RQE on
+held-out targets is made with those.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from threadpoolctl import threadpool_limits
 from flows.loop.problems import Part, inputs_of, picked_px, problem_of, settings_of
 from flows.steps import Paths, Plan, plain
 from pipeline.datasets import write_dataset
+from pipeline.errors import StageError
 from pipeline.residual_problem import Basis, ResidualProblem
 from pipeline.run_stage import StageRecord, run_stage, write_json
 from stages import closed_loop
@@ -30,10 +33,10 @@ def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
     """`root`/loop/<part>.json and .nc from the results in `plan.out`; the content of the JSON is the record's summary."""
 
     def work(to: Paths) -> dict[str, Any]:
-        with threadpool_limits(limits=1):
+        with threadpool_limits(limits=1), _telling(part):
             problem = problem_of(plan, part)
             result = closed_loop.run(problem, plan.settings.closed_loop, seed)
-            content = content_of(part, problem, result, folds_of(plan, part, problem))
+            content = content_of(part, problem, result)
             if part.stage == "geometry":
                 content["picked_px"] = picked_px(plan, result.values)
         write_json(to["result"], content)
@@ -44,7 +47,7 @@ def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
         root,
         "loop",
         part.name,
-        (*part.modules, "stages.closed_loop", "flows.loop.problems"),
+        ("stages.closed_loop", "flows.loop.problems"),
         {
             **settings_of(plan, part),
             "closed_loop": plain(plan.settings.closed_loop),
@@ -57,24 +60,39 @@ def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
     )
 
 
-def content_of(part: Part, problem: ResidualProblem, result: LoopResult, folds: list[list[int]]) -> dict[str, Any]:
-    """What loop.json and the page say of a part, in plain data; `folds`: labels of groups that figures are held out on."""
+@contextmanager
+def _telling(part: Part) -> Iterator[None]:
+    """Data of which no statistics can be made end in one line, and leave the other parts their turn."""
+    try:
+        yield
+    except (ArithmeticError, RuntimeError, ValueError) as error:  # numpy's and torch's linear algebra among them
+        raise StageError(f"no residual of the part {part.name} could be examined: {error}") from error
+
+
+def content_of(part: Part, problem: ResidualProblem, result: LoopResult) -> dict[str, Any]:
+    """What loop.json and the page say of a part, in plain data."""
     content = result.to_dict()
-    return {
+    return content | {
         "stage": part.stage,
         "bench": part.bench,
-        "verdict": result.verdict,
         "steps": [step | {"parameters": gathered(step["effect"], step["parameters"])} for step in content["steps"]],
-        "not_identifiable": content["not_identifiable"],
         "considered": plain(result.considered),
-        "notes": list(result.notes),
         "sealed": plain(result.sealed),
-        "heldout_rms": {"before": result.rms_before, "after": result.rms_after, "unit": problem.unit},
+        "heldout_rms": {
+            "before": _known(result.rms_before),
+            "after": _known(result.rms_after),
+            "unit": problem.unit,
+        },
         "samples": int(problem.group.size),
         "groups": [problem.group_names.get(int(g), str(g)) for g in np.unique(problem.group)],
         "effects": plain(nested(result.values)),
-        "without": _refits(problem, result, folds),
+        "without": _refits(problem, result) if part == Part("spectral") else [],
     }
+
+
+def _known(value: float) -> float | None:
+    """None where there is no figure: of a single group nothing is held out."""
+    return value if math.isfinite(value) else None
 
 
 def gathered(effect: str, parameters: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -95,24 +113,14 @@ def gathered(effect: str, parameters: Mapping[str, Mapping[str, Any]]) -> dict[s
     return out
 
 
-def folds_of(plan: Plan, part: Part, problem: ResidualProblem) -> list[list[int]]:
-    """Labels of the groups that figures are held out on together: the verification runs of a chamber; else two halves, the groups
-    taken in turn. No fold is all there is."""
+def _refits(problem: ResidualProblem, result: LoopResult) -> list[dict[str, Any]]:
+    """For each half of the groups, taken in turn, their names and the effects as the other half has them; empty where nothing was
+    added, or there are no halves."""
     labels = [int(g) for g in np.unique(problem.group)]
-    folds = [labels[0::2], labels[1::2]]
-    if part.stage == "thermal":
-        assert plan.opened.keys.thermal is not None
-        verify = tuple(f"{run}," for run in plan.opened.keys.thermal.verify)
-        folds = [[g for g in labels if problem.group_names.get(g, "").startswith(verify)]] if verify else []
-    return [fold for fold in folds if 0 < len(fold) < len(labels)]
-
-
-def _refits(problem: ResidualProblem, result: LoopResult, folds: list[list[int]]) -> list[dict[str, Any]]:
-    """For each fold its groups' names, and the effects as all other groups have them; empty where nothing was added."""
     out = []
-    for fold in folds if result.values else []:
-        values, _ = closed_loop.refit(problem, {k: dict(v) for k, v in result.values.items()}, fold)
-        names = [problem.group_names.get(g, str(g)) for g in fold]
+    for half in (labels[0::2], labels[1::2]) if result.values and len(labels) > 1 else ():
+        values = closed_loop.refit(problem, {k: dict(v) for k, v in result.values.items()}, half)
+        names = [problem.group_names.get(g, str(g)) for g in half]
         out.append({"groups": names, "effects": plain(nested(values))})
     return out
 

@@ -21,12 +21,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flows.steps import Plan, compensation, initial_attitude, naming, plain, turn_on
+from flows.steps import Plan, compensation, initial_attitude, naming, needed, plain, turn_on
 from pipeline.errors import StageError
 from pipeline.raster import Dem
 from pipeline.records import Tracks, Trajectory
 from pipeline.residual_problem import Parameters, ResidualProblem, joined
 from stages import bench, navigation, reconstruction, registration, thermal, tracking
+
+
+class NothingThere(StageError):
+    """A part whose files hold nothing that a residual can be made of."""
 
 
 @dataclass(frozen=True)
@@ -46,18 +50,6 @@ class Part:
         if self.bench is not None:
             return None
         return {"navigation": "thermal", "geometry": "navigation", "spectral": "tracking"}.get(self.stage)
-
-    @property
-    def modules(self) -> tuple[str, ...]:
-        """The code that its problem comes from."""
-        if self.bench is not None:
-            return ("stages.bench",)
-        return {
-            "thermal": ("stages.thermal",),
-            "navigation": ("stages.navigation", "stages.thermal"),
-            "geometry": ("stages.tracking", "stages.registration", "pipeline.raster"),
-            "spectral": ("stages.reconstruction",),
-        }[self.stage]
 
 
 def parts_of(plan: Plan) -> tuple[list[Part], dict[str, str]]:
@@ -101,16 +93,16 @@ def inputs_of(plan: Plan, part: Part) -> dict[str, Path]:
         if part.stage == "navigation":
             named[f"{flight.id}/gnss"] = campaign.path(flight.gnss)
             if compensation(plan, flight.id) != "none":
-                named[f"{flight.id}/thermal"] = plan.out / "thermal_model.nc"
+                named[f"{flight.id}/thermal"] = needed(plan.out / "thermal_model.nc", "thermal")
         for line in flight.lines if part.stage != "navigation" else ():
             unit = f"{flight.id}/{line.id}"
             named |= {f"{unit}/frames": campaign.path(line.frames), f"{unit}/targets": campaign.path(line.targets)}
             if part.stage == "geometry":
-                named[f"{flight.id}/trajectory"] = plan.out / flight.id / "trajectory.nc"
+                named[f"{flight.id}/trajectory"] = needed(plan.out / flight.id / "trajectory.nc", "navigation")
                 if line.gcps is not None:
                     named[f"{unit}/gcps"] = campaign.path(line.gcps)
             else:
-                named[f"{unit}/tracks"] = plan.out / unit / "pos_tracks.nc"
+                named[f"{unit}/tracks"] = needed(plan.out / unit / "pos_tracks.nc", "tracking")
     if part.stage == "geometry" and keys.dem is not None:
         named["dem"] = campaign.path(keys.dem)
     if part.stage == "spectral":
@@ -122,16 +114,17 @@ def inputs_of(plan: Plan, part: Part) -> dict[str, Path]:
 
 
 def settings_of(plan: Plan, part: Part) -> dict[str, Any]:
-    settings = plan.settings
+    """The settings, and what else of the campaign's keys, that its problem hangs on."""
+    settings, keys = plan.settings, plan.opened.keys
     if part.bench is not None:
-        return plain(settings.bench)
-    groups: Mapping[str, tuple[Any, ...]] = {
-        "thermal": (settings.thermal,),
-        "navigation": (settings.navigation, settings.thermal.method),
-        "geometry": (settings.tracking, settings.registration),
+        return {"settings": plain(settings.bench)}
+    hangs: Mapping[str, tuple[Any, ...]] = {
+        "thermal": (settings.thermal, keys.thermal),
+        "navigation": (settings.navigation, settings.thermal.method, [f.initial for f in keys.flights]),
+        "geometry": (settings.geometry, settings.registration),
         "spectral": (settings.reconstruction,),
     }
-    return {"settings": plain(groups[part.stage])}
+    return {"settings": plain(hangs[part.stage])}
 
 
 def problem_of(plan: Plan, part: Part) -> ResidualProblem:
@@ -188,8 +181,9 @@ def _navigation(plan: Plan) -> ResidualProblem:
     return joined(problems)
 
 
-def geometry_of(plan: Plan) -> dict[str, Any]:
-    """What `tracking.residual_problem` and `tracking.geometry_residual_px` are made of."""
+def geometry_of(plan: Plan, motion: bool = True) -> dict[str, Any]:
+    """What `tracking.residual_problem` and `tracking.geometry_residual_px` are made of; without `motion` of the images, points
+    and heights alone."""
     campaign = plan.opened
     camera, mounting = campaign.instrument.camera, campaign.instrument.mounting
     assert camera is not None and mounting is not None
@@ -203,35 +197,35 @@ def geometry_of(plan: Plan) -> dict[str, Any]:
                 frames.time,
                 campaign.gcps(flight, line),
                 campaign.targets(flight, line),
-                registration.image_motion(frames, camera, plan.settings.registration),
+                registration.image_motion(frames, camera, plan.settings.registration) if motion else None,
                 campaign.imu(flight).temperatures,
                 flight,
             )
         )
-    dem = None if campaign.keys.dem is None else Dem.from_file(campaign.path(campaign.keys.dem))
-    gyro = None if campaign.instrument.imu is None else campaign.instrument.imu.gyro
     return {
         "lines": lines,
         "camera": camera,
         "mounting": mounting,
-        "dem": dem,
+        "dem": None if campaign.keys.dem is None else Dem.from_file(campaign.path(campaign.keys.dem)),
+        "settings": plan.settings.geometry,
         "effects": plan.effects("geometry"),
-        "gyro": gyro,
+        "gyro": None if campaign.instrument.imu is None else campaign.instrument.imu.gyro,
     }
 
 
 def _geometry(plan: Plan) -> ResidualProblem:
     made = tracking.residual_problem(**geometry_of(plan))
     if made is None:
-        raise StageError(
+        raise NothingThere(
             "there are no control points, no texture to follow from frame to frame, and no heights to compare"
         )
     return made
 
 
 def picked_px(plan: Plan, found: Parameters) -> dict[str, float] | None:
-    """RMS of the control points [px] before, and after with each group predicted from the others; None without such points."""
-    before, after = tracking.geometry_residual_px(**geometry_of(plan), found=found)
+    """RMS of the control points [px] without `found`, and with it, each group predicted from the others; None without such
+    points."""
+    before, after = tracking.geometry_residual_px(**geometry_of(plan, motion=bool(found)), found=found)
     return {"before": before, "after": after} if math.isfinite(before) else None
 
 

@@ -33,7 +33,7 @@ Index = NDArray[np.intp]
 MOST_FOLDS = 8
 SHARED = 0.5  # of a signature that its shifted copy may explain and still be a control
 FEWEST_CONTROLS = 10
-NEEDED = 0.05  # p beside a fold's first choice, over the number of tests
+NEEDED = 0.05  # p beside a fold's first choice, over the number of effects, each paying for its own tests
 FEWEST_FOLDS = 4  # below which a likelihood alone decides nothing: the noise model cannot be held against itself
 
 
@@ -134,7 +134,7 @@ def confirm(
     choose, where the residual is not linear in it."""
     spread = channel_spread(problem, rows, refined, noise)
     touched = _touched(problem, refined.columns[:, refined.added])
-    totals = np.zeros(2)
+    totals, log_tests = np.zeros(2), np.log([list(families).count(one) for one in families])
     agree, same, gains = 0, True, []
     folds = [rows[f] for f in folds_of(problem.group[rows])]
     p = before.columns.shape[1]
@@ -144,15 +144,16 @@ def confirm(
         train = np.setdiff1d(rows, held)
         layout = Layout.of(problem, train)
         projected = project(gram(layout, noise, whole[train]), slice(0, p))
-        scores = []
+        scores: list[float] = []
         for columns in where:
             value, rank = statistic(projected, columns)
-            scores.append(log_tail(value, rank) if rank else np.inf)
+            scores.append(log_tail(value, rank) + log_tests[len(scores)] if rank else np.inf)
         best = int(np.argmin(scores))
         wanted = families[best] == families[chosen]
         if not wanted:  # another one comes first, and this one is needed beside it: two effects at once
             value, rank = statistic(project(projected, where[best]), where[chosen])
-            wanted = rank > 0 and log_tail(value, rank) < np.log(NEEDED / len(library))
+            tail = log_tail(value, rank) if rank else np.inf
+            wanted = tail + log_tests[chosen] < np.log(NEEDED / len(set(families)))
         model = (
             library[best]
             if not wanted

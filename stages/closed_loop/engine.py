@@ -86,7 +86,7 @@ def run(problem: ResidualProblem, settings: LoopSettings, seed: int) -> LoopResu
     state.noise = fit_noise(layout, state.nuisance[rows], null[rows])
     limits, considered = _first_look(problem, layout, state, candidates, settings)
     while len(state.steps) < settings.steps:
-        if _rms(problem, layout, state) <= problem.floor:
+        if _rms(layout, state) <= problem.floor:
             state.notes.append(
                 f"the residual is within the method's own accuracy, {problem.floor:.2g} {problem.unit} RMS"
             )
@@ -104,22 +104,16 @@ def run(problem: ResidualProblem, settings: LoopSettings, seed: int) -> LoopResu
     return _close(problem, layout, state, candidates, null, sealed, limits, considered, settings)
 
 
-def refit(
-    problem: ResidualProblem, values: Values, without: Sequence[int]
-) -> tuple[Values, Mapping[str, Mapping[str, float]]]:
-    """The parameters of the effects in `values`, and their sigmas, from all groups but those of `without`: what a figure on
-    held-out data is to be made with. Raises ValueError where no group is left."""
+def refit(problem: ResidualProblem, values: Values, without: Sequence[int] = ()) -> Values:
+    """The parameters of the effects in `values` from all groups but those of `without`: what a figure on held-out data is to be
+    made with. Raises ValueError where no group is left."""
     rows = np.flatnonzero(~np.isin(problem.group, list(without)))
     if rows.size == 0:
         raise ValueError(f"{problem.stage}: no group is left to fit on")
     layout, nuisance = Layout.of(problem, rows), np.asarray(problem.nuisance, float)
     candidates = {c.effect: c for c in problem.candidates}
     noise = fit_noise(layout, nuisance[rows], np.asarray(problem.residual(values), float)[rows])
-    found = estimate(problem, layout, nuisance, values, candidates, noise)
-    sigma: dict[str, dict[str, float]] = {effect: {} for effect in values}
-    for (effect, name), s in zip(found.order, found.sigma, strict=True):
-        sigma[effect][name] = float(s)
-    return found.values, sigma
+    return estimate(problem, layout, nuisance, values, candidates, noise).values
 
 
 def _seal(problem: ResidualProblem, settings: LoopSettings, rng: np.random.Generator) -> tuple[Index, int | None]:
@@ -131,7 +125,7 @@ def _seal(problem: ResidualProblem, settings: LoopSettings, rng: np.random.Gener
     return every[problem.group != sealed], sealed
 
 
-def _rms(problem: ResidualProblem, layout: Layout, state: State) -> float:
+def _rms(layout: Layout, state: State) -> float:
     """Of what the model's columns leave, by least squares."""
     columns, data = state.columns[layout.rows], state.residual[layout.rows]
     if columns.shape[1]:
@@ -401,22 +395,21 @@ def _drop_unneeded(
 ) -> None:
     """Effects that the last addition has made superfluous: a first choice that stood for something else.
 
-    What stays must still stand out of as many tests as the library makes.
+    What stays must still stand out of as many tests as the library makes, counted as in the search.
     """
-    tests = sum(max(len(c.grid), 1) for c in candidates.values())
     while state.estimate is not None:
         e = state.estimate
         p, rows = state.nuisance.shape[1], layout.rows
         whole = np.column_stack([state.nuisance, e.signatures, e.residual])[rows]
         m = project(gram(layout, e.noise, whole), slice(0, p))
-        weakest, highest = "", UNNEEDED / tests
+        weakest, highest = "", UNNEEDED / len(candidates)
         for effect in e.values:
             own = [p + c for c in e.columns(effect)]
             others = [p + c for c in range(len(e.order)) if p + c not in own]
             at = np.array([e.values[effect][e.order[c - p][1]] for c in own])
             information = project(m, others)[np.ix_(own, own)]
             rank = sum(bool(v > 0.0) for v in np.diag(information)) or 1
-            p_value = float(chdtrc(rank, max(at @ information @ at, 0.0)))
+            p_value = float(chdtrc(rank, max(at @ information @ at, 0.0))) * max(len(candidates[effect].grid), 1)
             if effect != last and p_value > highest:
                 weakest, highest = effect, p_value
         if not weakest:
@@ -561,8 +554,10 @@ def _close(
             )
             state.certain.append(names)
             steps, values, rms_after = [], {}, rms_before
+            state.refused |= {s.effect: f"taken back: the sealed group {name} is worse with it" for s in state.steps}
+            state.estimate, state.residual, state.nuisance = None, null, before.columns
     if problem.sigma is not None:
-        rms = _rms(problem, layout, state)
+        rms = _rms(layout, state)
         excess = (rms / problem.sigma) ** 2 * rows.size
         if rms > EXCESS * problem.sigma and chdtrc(rows.size - state.columns.shape[1], excess) < CERTAIN:
             told = f"what is left is {rms / problem.sigma:.3g} times the declared sigma"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.residual_problem import Candidate, ResidualProblem
 from stages.closed_loop.noise import Layout, Noise, deviance, fit_noise, gram, whitened
 from stages.closed_loop.score_test import project, solve
-from stages.closed_loop.signatures import Values, derivatives, merged
+from stages.closed_loop.signatures import Values, derivatives
 
 Array = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def descend(
         for _ in range(ITERATIONS):
             s = _signatures(problem, packed(at), candidates)
             m = project(gram(layout, noise, np.column_stack([nuisance, s, residual])[rows]), slice(0, p))
-            step, _, sigma = _bounded_step(m, own, at, low, high)
+            step, sigma = _bounded_step(m, own, at, low, high)
             share, moved = 1.0, False
             while share > 1e-3:
                 trial = np.clip(at + share * step, low, high)
@@ -159,8 +159,8 @@ def _named(values: Values, candidate: Candidate) -> tuple[str, ...]:
     return tuple(name for name in candidate.parameters if name in values[candidate.effect])
 
 
-def _bounded_step(m: Array, own: Sequence[int], at: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """Gauss–Newton step, covariance and sigma; parameters that the step would drive through their bound are held."""
+def _bounded_step(m: Array, own: Sequence[int], at: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Gauss–Newton step and sigma; parameters that the step would drive through their bound are held."""
     free = list(range(len(own)))
     step = np.zeros(len(own))
     while free:
@@ -174,14 +174,6 @@ def _bounded_step(m: Array, own: Sequence[int], at: Array, low: Array, high: Arr
             step[free] = delta
             sigma = np.zeros(len(own))
             sigma[free] = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-            return step, covariance, sigma
+            return step, sigma
         free = [i for i in free if i not in stuck]
-    return step, np.zeros((0, 0)), np.zeros(len(own))
-
-
-def without(values: Values, effect: str) -> Values:
-    """The values of all other effects."""
-    return {name: dict(parameters) for name, parameters in values.items() if name != effect}
-
-
-__all__ = ["Estimate", "descend", "estimate", "merged", "without"]
+    return step, np.zeros(len(own))

@@ -111,7 +111,7 @@ class LoopResult:
     pictures: Pictures
 
     def to_dict(self) -> dict[str, Any]:
-        """Keys as in loop.json; `before` and `after` hold this stage's held-out RMS."""
+        """Verdict, steps, limits and notes as plain data, with the keys of loop.json."""
         return {
             "verdict": self.verdict,
             "steps": [step.to_dict() for step in self.steps],
@@ -119,7 +119,5 @@ class LoopResult:
                 {"effects": list(one.effects), "why": one.why, "would_separate": one.would_separate}
                 for one in self.not_identifiable
             ],
-            "before": {f"{self.stage}_residual_rms": self.rms_before},
-            "after": {f"{self.stage}_residual_rms": self.rms_after},
             "notes": list(self.notes),
         }

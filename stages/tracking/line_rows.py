@@ -51,8 +51,8 @@ class Terrain(Protocol):
     def covers(self, latitude: Array, longitude: Array) -> NDArray[np.bool_]: ...
 
 
-class ResidualSettings(BaseModel):
-    """What is believed of POS, registration and DEM before the data say more."""
+class GeometrySettings(BaseModel):
+    """What the closed loop believes of POS, registration and DEM before the data say more."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -119,7 +119,7 @@ class Rows:
 class LineRows:
     """A line's rows at any geometry. Poses are kept for the last latencies; all else is cheap."""
 
-    def __init__(self, line: Line, null: Geometry, dem: Terrain | None, settings: ResidualSettings) -> None:
+    def __init__(self, line: Line, null: Geometry, dem: Terrain | None, settings: GeometrySettings) -> None:
         self.line, self.null, self.dem, self.settings = line, null, dem, settings
         motion, gcps = line.motion, line.gcps
         if gcps is not None and (gcps.frame >= line.stamps.size).any():

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from pipeline.residual_problem import Basis, Candidate, Parameter, Parameters, ResidualProblem
 from stages.tracking.curves import COVARIATES, Curves, Place, curves_of
-from stages.tracking.line_rows import SERIES, Geometry, Line, LineRows, ResidualSettings, Rows, Terrain, chosen
+from stages.tracking.line_rows import SERIES, Geometry, GeometrySettings, Line, LineRows, Rows, Terrain, chosen
 from stages.tracking.pos_errors import whitener
 from tsmftis.camera import Camera, Mounting
 from tsmftis.effects import EFFECTS, Effects
@@ -58,7 +58,7 @@ class _Campaign:
         camera: Camera,
         mounting: Mounting,
         dem: Terrain | None,
-        settings: ResidualSettings,
+        settings: GeometrySettings,
         effects: Effects,
         gyro: SensorModel | None,
     ) -> None:
@@ -69,7 +69,7 @@ class _Campaign:
         if self.mistaken():
             self._lay_out(settings)
 
-    def _lay_out(self, settings: ResidualSettings) -> None:
+    def _lay_out(self, settings: GeometrySettings) -> None:
         rows = [line.rows() for line in self.lines]
         flat = [r for one in rows for r in one]
         size = [sum(r.frame.size for r in one) for one in rows]
@@ -94,7 +94,7 @@ class _Campaign:
         u = self._shared(rows, n, settings) / sigma[:, None]
         self.whiten = whitener(u)
 
-    def _shared(self, rows: Sequence[Sequence[Rows]], n: int, settings: ResidualSettings) -> Array:
+    def _shared(self, rows: Sequence[Sequence[Rows]], n: int, settings: GeometrySettings) -> Array:
         """Columns (n, m), in the residual's own units, of what many rows share."""
         flights: dict[str, Array] = {}
         columns = []
@@ -284,7 +284,7 @@ def residual_problem(
     camera: Camera,
     mounting: Mounting,
     dem: Terrain | None,
-    settings: ResidualSettings | None = None,
+    settings: GeometrySettings | None = None,
     effects: Effects | None = None,
     gyro: SensorModel | None = None,
 ) -> ResidualProblem | None:
@@ -292,7 +292,7 @@ def residual_problem(
 
     `effects` are those that models have by now; those of other stages change nothing here.
     """
-    made = _Campaign(lines, camera, mounting, dem, settings or ResidualSettings(), effects or {}, gyro)
+    made = _Campaign(lines, camera, mounting, dem, settings or GeometrySettings(), effects or {}, gyro)
     if made.count == 0:
         return None
     order, blocks = made.order, made.blocks
@@ -323,7 +323,7 @@ def geometry_residual_px(
     mounting: Mounting,
     dem: Terrain | None,
     found: Parameters,
-    settings: ResidualSettings | None = None,
+    settings: GeometrySettings | None = None,
     effects: Effects | None = None,
     gyro: SensorModel | None = None,
 ) -> tuple[float, float]:
@@ -332,7 +332,7 @@ def geometry_residual_px(
     With: each group is predicted by the effects' values as all other groups give them (one Gauss–Newton step from `found`, which
     has seen all), so that no point is held against a fit of its own.
     """
-    made = _Campaign(lines, camera, mounting, dem, settings or ResidualSettings(), effects or {}, gyro)
+    made = _Campaign(lines, camera, mounting, dem, settings or GeometrySettings(), effects or {}, gyro)
     if made.count == 0 or not (made.channel < 2).any():
         return float("nan"), float("nan")
     before = float(np.sqrt(np.mean(made.picks({}) ** 2)))

@@ -112,21 +112,28 @@ def test_a_single_interferogram_is_the_instrument(laboratory: Path, tmp_path: Pa
     assert set(update.effects) == {"detector_nonlinearity"} and not update.bench
 
 
-def test_an_undeclared_camera_latency_is_traced_and_taken_out(tmp_path: Path, tsmftis: Any) -> None:
-    campaign, out = tiny_campaign(tmp_path / "tiny", 1, {"camera_latency": {"latency": 0.012}}), tmp_path / "loop"
+def test_undeclared_effects_of_two_stages_are_traced_and_taken_out(tmp_path: Path, tsmftis: Any) -> None:
+    true = {"camera_latency": 0.012, "gnss_latency": 0.3}
+    campaign = tiny_campaign(tmp_path / "tiny", 1, {name: {"latency": value} for name, value in true.items()})
+    out = tmp_path / "loop"
     answer = tsmftis("close-loop", campaign, "--out", out)
     assert answer.code == 0, answer.out + answer.err
     content = loop_of(out)
-    assert list(content["parts"]) == sorted(("thermal", "navigation", "geometry", "spectral"))
-    (step,) = [s for s in content["steps"] if s["stage"] == "geometry"]
-    found = step["parameters"]["latency"]
-    assert step["effect"] == "camera_latency" and found["unit"] == "s"
-    assert abs(found["value"] - 0.012) < 3.0 * found["sigma"]
+    assert set(content["parts"]) == {"thermal", "navigation", "geometry", "spectral"} and not content["not_examined"]
+    found = {
+        step["effect"]: step["parameters"] for step in content["steps"] if step["stage"] in ("navigation", "geometry")
+    }
+    assert set(found) == set(true)
+    for effect, value in true.items():
+        latency = found[effect]["latency"]
+        assert latency["unit"] == "s" and abs(latency["value"] - value) < 3.0 * latency["sigma"]
     before, after = content["before"], content["after"]
     assert after["geometry_residual_px"] < 0.5 * before["geometry_residual_px"]
+    assert after["navigation_withheld_m"][0] < 0.5 * before["navigation_withheld_m"][0]
     assert after["rqe_area_tracking_mean"] < before["rqe_area_tracking_mean"]
     run = json.loads((out / "after" / "run.json").read_text())
-    assert run["provenance"]["model_update"]["effects"]["camera_latency"]["latency"] == found["value"]
+    update = run["provenance"]["model_update"]["effects"]
+    assert {name: update[name]["latency"] for name in true} == {n: found[n]["latency"]["value"] for n in true}
     assert run["rqe"]["tracking"] == pytest.approx(after["rqe_tracking_mean"], rel=0.05)
 
 
