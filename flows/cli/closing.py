@@ -123,7 +123,7 @@ def print_loop(console: Console, content: dict[str, Any]) -> None:
         if key in content["before"]:
             table.add_row(label, *(_figure(content[when][key]) for when in ("before", "after")))
     if table.row_count:
-        console.print(table)
+        Console(highlight=False, width=136).print(table)  # as wide as it is, also in a narrow window
 
 
 def _figure(value: float | list[float]) -> str:
