@@ -387,6 +387,18 @@ def _describe_line(
     gcps = found.attempt(campaign.gcps, flight, line)
     if gcps is not None:
         found.add(part, ground_control=f"{gcps.frame.size} points")
+        if (camera := campaign.instrument.camera) is not None:
+            for column, values, size in (("row", gcps.row, camera.rows), ("col", gcps.col, camera.cols)):
+                beyond = np.flatnonzero((values < -1.0) | (values > size))
+                if beyond.size:
+                    found.problems.append(
+                        InputError(
+                            campaign.path(keys.gcps or ""),
+                            f"point {beyond[0] + 1}, column {column}",
+                            f"is {values[beyond[0]]:g}, outside the image of {camera.rows} × {camera.cols} pixels",
+                            "count pixels from 0, or leave the point out",
+                        )
+                    )
         if frames is not None and gcps.frame.max(initial=0) >= frames.time.size:
             found.problems.append(
                 InputError(

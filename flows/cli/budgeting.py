@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from flows.cli.running import alone, belongs
+from flows.cli.running import alone, belongs, make
 from flows.settings import load_settings
 from flows.steps import Plan
 from pipeline.campaign import Campaign, read_campaign
@@ -64,7 +64,7 @@ def budget(
     _check(plan, opened, out, truth)
     for warning in check_campaign(opened).warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False)
-    plan.out.mkdir(parents=True, exist_ok=True)
+    make(plan, out)
     with alone(plan, out):
         _process(plan, None if truth is None else truth.resolve(), console)
     content = json.loads((plan.out / "budget.json").read_text(encoding="utf-8"))

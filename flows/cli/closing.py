@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from flows.cli.running import alone, belongs
+from flows.cli.running import alone, belongs, make
 from flows.settings import load_settings
 from flows.steps import Plan
 from pipeline.campaign import read_campaign
@@ -60,7 +60,7 @@ def close_loop(
     for warning in check_campaign(opened).warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False)
     _refuse_nothing(plan)
-    plan.out.mkdir(parents=True, exist_ok=True)
+    make(plan, out)
     with alone(plan, out):
         failed = _process(plan, seed, console)
     console.print(
@@ -116,12 +116,13 @@ def print_loop(console: Console, content: dict[str, Any]) -> None:
             console.print(f"? {name}: {'; '.join(answer['notes'])}", markup=False)
     for name, why in content["not_examined"].items():
         console.print(f"- {name} was not looked at: {why}", markup=False)
+    times = ("before", "after") if content["before"] != content["after"] else ("before",)
     table = Table(show_edge=False, header_style="bold", pad_edge=False)
-    for name in ("on held-out data", "before", "after"):
+    for name in ("on held-out data", *(times if len(times) > 1 else ("as declared",))):
         table.add_column(name, justify="left" if name[0] == "o" else "right")
     for key, label in FIGURES:
         if key in content["before"]:
-            table.add_row(label, *(_figure(content[when][key]) for when in ("before", "after")))
+            table.add_row(label, *(_figure(content[when][key]) for when in times))
     if table.row_count:
         Console(highlight=False, width=136).print(table)  # as wide as it is, also in a narrow window
 

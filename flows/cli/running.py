@@ -98,11 +98,7 @@ def run(
     inspection = check_campaign(opened)
     for warning in inspection.warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False)
-    try:
-        plan.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(out, "--out", f"cannot be made ({error.strerror})", "give another folder") from error
-
+    make(plan, out)
     try:
         with alone(plan, out):
             _process(plan, opened, inspection.warnings, dask, console)
@@ -179,6 +175,14 @@ def belongs(plan: Plan, name: str, out: Path, kept: str = "run.json") -> None:
             f"holds results of the campaign '{before}', not of '{name}'",
             "give another folder, or remove it",
         )
+
+
+def make(plan: Plan, out: Path) -> None:
+    """The folder for the results."""
+    try:
+        plan.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(out, "--out", f"cannot be made ({error.strerror})", "give another folder") from error
 
 
 @contextlib.contextmanager

@@ -146,6 +146,9 @@ def evidence(d: xr.Dataset, term: str) -> go.Figure:
     x = d[term].values
     reach = [float(x.min()), float(x.max())]
     edges = np.linspace(reach[0], reach[1], EVIDENCE_BINS + 1)
+    at, _, _ = binned(x, x, edges)
+    if at.size > 1:
+        reach = [float(at.min() - 0.15 * np.ptp(at)), float(at.max() + 0.15 * np.ptp(at))]
     figure = go.Figure()
     figure.add_scatter(x=reach, y=reach, mode="lines", name="slope 1", line={"color": "#c0392b", "width": 1.2})
     figure.add_hline(y=0.0, line={"color": "#999", "width": 1})
@@ -184,6 +187,7 @@ def covariates(d: xr.Dataset) -> go.Figure:
             _points(figure, d[k].values[mine], d[name].values[mine], edges, name, i == 0 and not same, **where)
     figure.update_yaxes(title=f"[{d['before'].attrs['units']}]", col=1)
     figure.update_annotations(font_size=13)
+    figure.update_xaxes(exponentformat="e")
     layout(figure, 130 + 210 * rows)
     figure.update_layout(margin={"t": 85}, legend={"y": 1.0 + 45.0 / (210.0 * rows)})
     return figure

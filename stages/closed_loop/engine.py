@@ -61,6 +61,7 @@ class State:
     notes: list[str] = field(default_factory=list)
     certain: list[str] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)
+    enough: bool = False
     noise: Noise | None = None
 
     @property
@@ -90,6 +91,7 @@ def run(problem: ResidualProblem, settings: LoopSettings, seed: int) -> LoopResu
             state.notes.append(
                 f"the residual is within the method's own accuracy, {problem.floor:.2g} {problem.unit} RMS"
             )
+            state.enough = True
             break
         if _named_step(problem, layout, state, candidates, settings, rng):
             continue
@@ -573,8 +575,9 @@ def _close(
         for s in steps
         if s.indistinguishable_from
     ]  # fmt: skip
-    named = {frozenset(f.effects) for f in families}
-    limits = [*families, *(one for one in limits if frozenset(one.effects) not in named)]
+    # What could not be told at a plausible size, and was told at the size that it has, is no limit.
+    added = {s.effect for s in steps}
+    limits = [*families, *(one for one in limits if not added & set(one.effects))]
     verdict: Verdict = "effects_added" if steps else "unexplained" if state.certain else "no_effect"
     return LoopResult(
         problem.stage,
@@ -599,6 +602,8 @@ def _outcome(effect: str, steps: Sequence[Step], state: State) -> str:
         return f"cannot be told from {', '.join(other)}"
     if effect in state.dropped:
         return "taken out again"
+    if state.enough:
+        return "not asked: what is left is within the method's own accuracy"
     return state.refused.get(effect, "does not stand out" if not steps else "does not stand out beside what was added")
 
 

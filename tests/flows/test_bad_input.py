@@ -379,6 +379,7 @@ CAMPAIGNS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "gcp in a frame that is not there": (csv_column(GCPS, (0, "5000")), ("L01_gcps.csv", "frame")),
     "gcp in half a frame": (csv_column(GCPS, (0, "10.5")), ("L01_gcps.csv", "line 2", "frame")),
     "gcp with a text": (csv_column(GCPS, (1, "left")), ("L01_gcps.csv", "line 2", "row", "'left'")),
+    "gcp beside the image": (csv_column(GCPS, (2, "500.3")), ("L01_gcps.csv", "point 1, column col", "48 × 64")),
     # dem
     "dem is a text file": (content("dem.tif", "60 61 62\n"), ("dem.tif", "raster")),
     "dem truncated": (truncated("dem.tif"), ("dem.tif", "raster")),
