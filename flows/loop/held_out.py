@@ -132,7 +132,7 @@ def _thermal(plan: Plan, effects: Effects) -> Figures:
     if not keys.verify:
         return {}
     train, verify = ([plan.opened.chamber(n) for n in part] for part in (keys.train, keys.verify))
-    problem = thermal.residual_problem(train, [], plan.settings.thermal, turn_on(plan.opened))
+    problem = thermal.residual_problem(train, [], plan.settings.thermal)
     found = closed_loop.refit(problem, flat(effects))
     table = thermal.run(train, verify, plan.settings.thermal, turn_on(plan.opened), nested(found)).verification
     return {f"thermal_{key}": table[key][_method(plan)] for key in ("gyro_std_deg_per_h", "accel_std_ug")}

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from flows.steps import Plan, compensation, initial_attitude, naming, needed, plain, turn_on
+from flows.steps import Plan, compensation, initial_attitude, naming, needed, plain
 from pipeline.errors import StageError
 from pipeline.raster import Dem
 from pipeline.records import Tracks, Trajectory
@@ -145,7 +145,7 @@ def _thermal(plan: Plan) -> ResidualProblem:
     keys = plan.opened.keys.thermal
     assert keys is not None
     train, verify = ([plan.opened.chamber(n) for n in part] for part in (keys.train, keys.verify))
-    return thermal.residual_problem(train, verify, plan.settings.thermal, turn_on(plan.opened), plan.effects("thermal"))
+    return thermal.residual_problem(train, verify, plan.settings.thermal, plan.effects("thermal"))
 
 
 def flight_of(plan: Plan, flight: str) -> dict[str, Any]:

@@ -144,13 +144,12 @@ def residual_problem(
     train: Sequence[Chamber],
     verify: Sequence[Chamber],
     settings: ThermalSettings,
-    turn_on: tuple[float, float] | None = None,
     effects: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> ResidualProblem:
     """Of all runs together, r in noises of a block.
 
     Thermal `effects` (nested, as in a model update) belong to the model already and are no candidates; those of other stages do
-    not matter. Every run has a level of its own, whatever `turn_on` says: a loop tells shapes, not levels.
+    not matter. Every run has a level of its own: a loop tells shapes, not levels.
     """
     known = {name: values for name, values in (effects or {}).items() if EFFECTS[name].stage == "thermal"}
     chambers = [*train, *verify]
