@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import plotly.graph_objects as go
-from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
-from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 
 from pipeline.report.figures import layout
+from pipeline.report.page import write_page
 
 ROW, COL = "#0b63b0", "#e07b00"
 POINT, AREA = "#8c8c8c", "#0b63b0"
@@ -29,25 +27,13 @@ KINDS = (("point", "one point", POINT), ("area", "area mean", AREA))
 
 def write_budget_page(content: dict[str, Any], path: Path) -> None:
     """Write the page for the content of budget.json."""
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["number"] = number
-    environment.filters["share"] = share
-    template = environment.from_string(files("pipeline.report").joinpath("budget.html").read_text(encoding="utf-8"))
     shown = figure(content).to_html(
         full_html=False,
         include_plotlyjs=False,
         div_id="figure-1",
         config={"displaylogo": False, "responsive": True},
     )
-    path.write_text(
-        template.render(
-            content=content,
-            figure=Markup(shown),
-            plotly=Markup(get_plotlyjs()),
-            style=Markup(files("pipeline.report").joinpath("page.css").read_text(encoding="utf-8")),
-        ),
-        encoding="utf-8",
-    )
+    write_page(path, "budget.html", {"number": number, "share": share}, content=content, figure=Markup(shown))
 
 
 def number(value: float | None, digits: int = 2) -> str:

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import json
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
 from numpy.typing import NDArray
-from plotly.offline import get_plotlyjs
 from plotly.subplots import make_subplots
 from scipy.stats import norm
 
 from pipeline.datasets import open_dataset
 from pipeline.report.figures import layout, thin
-from pipeline.report.page import Numbered, significant
+from pipeline.report.page import Numbered, significant, write_page
 from tsmftis.geodesy import STANDARD_GRAVITY
 
 Array = NDArray[np.float64]
@@ -47,9 +43,6 @@ def write_loop_page(content: dict[str, Any], out: Path) -> Path:
     """Write `out`/loop.html for the content of loop.json; returns its path."""
     content = content | {"parts": {name: content["parts"][name] for name in sorted(content["parts"], key=_order)}}
     draw = Numbered()
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"figure": significant, "sigmas": sigmas, "values": values}
-    template = environment.from_string(files("pipeline.report").joinpath("loop.html").read_text(encoding="utf-8"))
     places = content["provenance"]["runs"]
     runs = [json.loads((out / places[when]).read_text(encoding="utf-8")) for when in COLOURS]
     shown = {}
@@ -60,20 +53,16 @@ def write_loop_page(content: dict[str, Any], out: Path) -> Path:
                 "covariates": draw.html(covariates(d.load())),
                 "residual": draw.html(residual(d.load())),
             }
-    text = template.render(
+    return write_page(
+        out / "loop.html",
+        "loop.html",
+        {"figure": significant, "sigmas": sigmas, "values": values},
         content=content,
         figures=[(label, content["before"][k], content["after"][k]) for k, label in FIGURES if k in content["before"]],
         held_out=[(label, k) for k, label in FIGURES if k in content["held_out"]],
         shown=shown,
         targets=draw.html(targets(*runs)) if runs[0].get("rqe") and places["before"] != places["after"] else None,
-        plotly=Markup(get_plotlyjs()),
-        style=Markup(files("pipeline.report").joinpath("page.css").read_text(encoding="utf-8")),
     )
-    path = out / "loop.html"
-    temporary = path.with_name("loop.html.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
-    return path
 
 
 def _order(part: str) -> tuple[int, str]:

@@ -38,30 +38,39 @@ class Numbered:
         )
 
 
+def write_page(path: Path, template: str, filters: dict[str, Any], **content: Any) -> Path:
+    """A self-contained page of a template of this package, by a temporary file and one rename; returns `path`."""
+    here = files("pipeline.report")
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= filters
+    text = environment.from_string(here.joinpath(template).read_text(encoding="utf-8")).render(
+        plotly=Markup(get_plotlyjs()),
+        style=Markup(here.joinpath("page.css").read_text(encoding="utf-8")),
+        **content,
+    )
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
+    return path
+
+
 def write_report(
     campaign: Campaign, out: Path, run: dict[str, Any], settings: dict[str, Any], warnings: list[str]
 ) -> Path:
     """Write `out`/report.html for what `run` (the content of run.json) lists; returns its path."""
     draw = Numbered()
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters["figure"] = significant
-    template = environment.from_string(files("pipeline.report").joinpath("page.html").read_text(encoding="utf-8"))
-    content = template.render(
+    return write_page(
+        out / "report.html",
+        "page.html",
+        {"figure": significant},
         run=run,
         ladder=[method for method in LADDER if method in run.get("rqe", {})],
         settings=json.dumps(settings, indent=1, sort_keys=True),
         warnings=warnings,
-        plotly=Markup(get_plotlyjs()),
         thermal=_thermal(out, run, draw),
         flights=[_flight(campaign, out, f, run, draw) for f in run["flights"]],
         bench=[_bench(out, b, run, draw) for b in run["bench"]],
-        style=Markup(files("pipeline.report").joinpath("page.css").read_text(encoding="utf-8")),
     )
-    path = out / "report.html"
-    temporary = path.with_name("report.html.tmp")
-    temporary.write_text(content, encoding="utf-8")
-    temporary.replace(path)
-    return path
 
 
 def significant(value: Any, digits: int = 3) -> str:
