@@ -37,6 +37,9 @@ CERTAIN = 1e-3  # family-wise p of structure that is there, though nothing accou
 UNNEEDED = 0.05  # p of an effect beside others
 COVARIATE_WINS = 0.01
 CHANGES = 0.1  # of an effect's χ²
+IS_CURVE = (
+    0.05  # of a term's norm, left beside the curves of a covariate: it is one of them, but for rounding and perspective
+)
 EXCESS = 1.1  # RMS over a known sigma that is structure
 
 
@@ -358,7 +361,8 @@ def _centred(covariate: Array | Basis, rows: Index) -> Array:
 def _better_covariate(
     problem: ResidualProblem, layout: Layout, helped: Array, columns: Array, data: Array, term: Array, noise: Noise
 ) -> str | None:
-    """The covariate whose spline leaves nothing of the effect's term, while the term leaves much of the spline.
+    """The covariate whose spline leaves nothing of the effect's term, while the term leaves much of the spline; or of which the
+    term is itself a curve, while the data ask for another one.
 
     What the next two other effects take up beside the term (`helped`) is not held against it.
     """
@@ -369,13 +373,15 @@ def _better_covariate(
         extra = fit_noise(layout, np.column_stack([columns[rows], term[rows], spline[rows]]), data[rows], noise)
         m = gram(layout, extra, np.column_stack([helped, spline[rows], data[rows]]))
         h = helped.shape[1]
-        value, rank = statistic(project(m, slice(0, h)), range(h, h + q))
-        if not rank or (p_spline := float(chdtrc(rank, value))) >= lowest:
+        gained, rank = statistic(project(m, slice(0, h)), range(h, h + q))
+        if not rank or (p_spline := float(chdtrc(rank, gained))) >= lowest:
             continue
-        off = [*range(p), *range(p + 1, h), *range(h, h + q)]
-        value, rank = statistic(project(m, off), [p])
-        # Without rank the term is itself a curve of this covariate, and the data ask for another one.
-        if not rank or float(chdtrc(rank, value)) > UNNEEDED:
+        rest = [i for i in range(h) if i != p]
+        own, beside = project(m, rest), project(m, [*rest, *range(h, h + q)])
+        explained, _ = statistic(own, [p])
+        is_curve = beside[p, p] <= IS_CURVE**2 * own[p, p] and gained > CHANGES * explained
+        value, rank = statistic(beside, [p])
+        if is_curve or not rank or float(chdtrc(rank, value)) > UNNEEDED:
             winner, lowest = name, p_spline
     return winner
 

@@ -30,7 +30,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import lapack, qr
 from scipy.optimize import minimize
 
 from pipeline.residual_problem import ResidualProblem
@@ -41,7 +41,7 @@ Index = NDArray[np.intp]
 LOG_KAPPA = (np.log(1e-9), np.log(1e6))
 LONGEST = 30.0  # τ over the longest series: a random walk
 SHORTEST = 0.7  # τ over the median step: shorter is white
-RANK = 1e-9  # singular values below this share of the largest are none
+RANK = 1e-9  # columns of which less than this share is left beside the others are none
 ROUNDING = 1e-11  # share of a squared norm that is none
 FEWEST = 4  # degrees of freedom below which no variance is estimated
 
@@ -165,8 +165,9 @@ def basis(columns: Array) -> Array:
     used = length > 0.0
     if not used.any():
         return np.zeros((len(columns), 0))
-    u, s, _ = np.linalg.svd(columns[:, used] / length[used], full_matrices=False)
-    return np.asarray(u[:, s > RANK * s[0]])
+    q, r, _ = qr(columns[:, used] / length[used], mode="economic", pivoting=True, check_finite=False)
+    size = np.abs(np.diag(r))
+    return np.asarray(q[:, : np.count_nonzero(size > RANK * size[0])])
 
 
 def criterion(channel: Channel, kappa: float, tau: float, x: Array, y: Array) -> tuple[float, float, float]:

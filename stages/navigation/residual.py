@@ -15,6 +15,10 @@ Start, linearisation and outliers must not depend on the effect that is looked f
 every candidate with a wide prior; fixes that even that run refuses are left out, all others are believed by every pass. The
 start's position and velocity are left open, since an arm or a latency shifts them.
 
+Receivers filter their velocities, which then lag the fixes that they come with. That is the receiver's own affair and no latency
+of its clock: a lag of the velocities alone is a nuisance of every problem that has velocities. What it does changes with the
+latency, so that it is fitted, and taken off, at every θ.
+
 Functions
 ---------
 residual_problem    of one flight
@@ -56,6 +60,7 @@ OPEN_POSITION, OPEN_VELOCITY = 30.0, 1.0  # m, m/s: the start's sigmas
 WIDER = 20.0  # times the declared sigmas of scale factors: the prior of the run that the start is taken from
 WIDE_ARM, WIDE_LATENCY = 1.0, 0.5  # m, s: the same
 SIGMAS = 5.0  # of the declared scale factor's: a size worth naming
+VELOCITIES = 3  # components of a fix, before those of its velocity
 MINUTE, SHORTEST, GROUPS = 60.0, 15.0, 8  # s, s: what is held out is a minute, or an eighth of a shorter flight
 FEWEST_FIXES = 20
 KEPT = 8  # linearisations in memory
@@ -66,11 +71,18 @@ COMPONENTS = ("north", "east", "down", "north velocity", "east velocity", "down 
 
 @dataclass(frozen=True)
 class Linearisation:
-    """At θ (13,): r (n,) and S = −∂r/∂θ (n, 13)."""
+    """At θ (13,): r (n,), S = −∂r/∂θ (n, 13), and the same for a lag of the velocities alone (n,)."""
 
     theta: Array
     residual: Array
     signatures: Array
+    velocity_lag: Array
+
+    def without_lag(self, residual: Array) -> Array:
+        """What a lag of the velocities leaves of a residual (n,) near here."""
+        length = float(self.velocity_lag @ self.velocity_lag)
+        share = float(self.velocity_lag @ residual) / length if length > 0.0 else 0.0
+        return np.asarray(residual - share * self.velocity_lag)
 
 
 @dataclass
@@ -95,12 +107,12 @@ class Innovations:
             moved = off[off != 0.0]
             if moved.size == 0 or (moved.size == 1 and abs(abs(moved[0]) - 1.0) < EXACT):
                 self.kept.move_to_end(key)
-                return np.asarray(one.residual - one.signatures @ (off * self.steps))
+                return one.without_lag(one.residual - one.signatures @ (off * self.steps))
         made = self.at(at)
         self.kept[at.tobytes()] = made
         if len(self.kept) > KEPT:
             self.kept.popitem(last=False)
-        return made.residual
+        return made.without_lag(made.residual)
 
     def at(self, at: Array) -> Linearisation:
         """The filter, run at θ; a fix that a latency carries into a gap of the inertial data says nothing there: zero."""
@@ -110,7 +122,7 @@ class Innovations:
         problem = replace(self.null, theta=theta, latency=float(theta[states.parameter("gnss_latency")][0]))
         gathered, _, count, store = forward(problem, CANDIDATES, self.refused)
         active = states.estimated({*problem.settings.estimate, *CANDIDATES})
-        begun = np.zeros((active.size, len(self.order)))
+        begun = np.zeros((active.size, len(self.order) + 1))  # the last one: velocities that lag
         for column, (effect, name) in enumerate(self.order):
             place = states.GROUPS[effect].start + list(EFFECTS[effect].units).index(name)
             begun[np.searchsorted(active, place), column] = 1.0
@@ -118,20 +130,22 @@ class Innovations:
         m = int(gathered.measurements.size[fixes[0]])
         weights = np.where(store.used[fixes, None, None], store.S_inv[fixes, :m, :m], np.eye(m))
         if not (np.isfinite(weights).all() and np.isfinite(store.y[fixes]).all()):
-            return Linearisation(at, np.full(m * fixes.size, np.nan), np.full((m * fixes.size, at.size), np.nan))
+            none = np.full(m * fixes.size, np.nan)
+            return Linearisation(at, none, np.full((none.size, at.size), np.nan), none)
         root = _roots(weights)
         y = np.einsum("kij,kj->ik", root, store.y[fixes, :m])
 
         def signatures(jolts: Array) -> Array:
-            carried = np.zeros((store.rows.size, 6, len(self.order)))
-            _carry(count, active, store, begun.copy(), self._latency, jolts, carried)
+            carried = np.zeros((store.rows.size, 6, len(self.order) + 1))
+            late = np.searchsorted(active, states.GROUPS["gnss_latency"].start)
+            _carry(count, active, store, begun.copy(), late, self._latency, jolts, carried)
             return np.asarray(np.einsum("kij,kjq->ikq", root, carried[fixes, :m]).reshape(y.size, -1))
 
         s = signatures(np.zeros((store.rows.size, 3)))
         off, sigma = _beside_all(s, y.ravel(), self._latency)
         if abs(off) + 2.0 * sigma < PHASE:
             s = signatures(_jolts(problem, gathered, count, store))
-        return Linearisation(at, y.ravel(), s)
+        return Linearisation(at, y.ravel(), s[:, :-1], s[:, -1])
 
     @property
     def _latency(self) -> int:
@@ -170,10 +184,11 @@ def _jolts(problem: Problem, gathered: Gathered, count: int, store: kalman.Store
 
 
 @numba.njit(cache=True, nogil=True)
-def _carry(count, active, store, error, latency, jolts, out):  # type: ignore[no-untyped-def]
+def _carry(count, active, store, error, late, latency, jolts, out):  # type: ignore[no-untyped-def]
     """H·e⁻ (m, 6, q) at every measurement for errors (n, q) at the start, by the filter's own Φ, H and K; `error` is used up.
 
-    jolts (m, 3) [m/s²]: what H leaves out of the velocities' derivative by the latency, which is column `latency`.
+    The latency is state `late` and column `latency`; the last column is a lag of the velocities alone, which no state holds.
+    jolts (m, 3) [m/s²]: what H leaves out of the velocities' derivative by the latency.
     """
     n = active.size
     for e in range(1, count):
@@ -190,6 +205,7 @@ def _carry(count, active, store, error, latency, jolts, out):  # type: ignore[no
             shown = np.ascontiguousarray(store.H[at, :m]) @ error
             for i in range(m - 3):
                 shown[3 + i, latency] -= jolts[at, i]
+                shown[3 + i, -1] += store.H[at, 3 + i, late] - jolts[at, i]
             out[at, :m] = shown
             error -= np.ascontiguousarray(store.K[at, :, :m]) @ shown
 
@@ -251,7 +267,8 @@ def residual_problem(
     order = tuple((c.effect, name) for c in candidates for name in c.parameters)
     steps = np.array([c.parameters[name].difference for c in candidates for name in c.parameters])
     innovations = Innovations(null, refused, chosen, order, steps)
-    count = innovations({}).size // chosen.size
+    first = innovations.at(np.zeros(len(order)))
+    count = first.residual.size // chosen.size
     time = gnss.time[chosen]
     group, names = _groups(time)
     component = np.repeat(np.arange(count), chosen.size)
@@ -262,7 +279,7 @@ def residual_problem(
         group=np.tile(group, count),
         series=component,
         time=np.tile(time, count),
-        nuisance=np.zeros((component.size, 0)),
+        nuisance=first.velocity_lag[:, None] if count > VELOCITIES else np.zeros((component.size, 0)),
         channel=component,
         covariates=_covariates(solution, chosen, count, temperature),
         unit="sigma",

@@ -56,7 +56,10 @@ COVARIATES: Mapping[str, Callable[[Place], Array]] = {
 
 @dataclass(frozen=True)
 class Curves:
-    """Of x: (x − centre)/spread, and cardinal splines of the inner knots less their own `line` (2, k)."""
+    """Of x: (x − centre)/spread, and cardinal splines of the inner knots less their own `line` (2, k).
+
+    A curve of a distance has its centre at zero, and the line that is taken off goes through it: a scale is then the line itself.
+    """
 
     centre: float
     spread: float
@@ -85,14 +88,14 @@ class Curves:
         return np.asarray(spline(inside) + spline(inside, 1) * (x - inside)[:, None])
 
 
-def curves_of(values: Array) -> Curves | None:
-    """None where the values do not vary or are not known."""
+def curves_of(values: Array, distance: bool = False) -> Curves | None:
+    """None where the values do not vary or are not known; `distance`: they are distances from a point that does not move."""
     spread = float(np.std(values))
     if not np.isfinite(spread) or spread <= CONSTANT * max(1.0, float(np.max(np.abs(values)))):
         return None
     knots = np.unique(np.quantile(values, np.linspace(0.0, 1.0, KNOTS)))
-    made = Curves(float(values.mean()), spread, knots, np.zeros((2, 0)))
+    made = Curves(0.0 if distance else float(values.mean()), spread, knots, np.zeros((2, 0)))
     if knots.size < KNOTS:
         return made
-    flat = np.column_stack([np.ones(values.size), (values - made.centre) / spread])
+    flat = np.column_stack([np.full(values.size, float(not distance)), (values - made.centre) / spread])
     return replace(made, line=np.asarray(np.linalg.lstsq(flat, made.bends(values), rcond=None)[0], float))

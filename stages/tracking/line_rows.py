@@ -293,15 +293,21 @@ class LineRows:
         return constant(*sizes)
 
     def places(self) -> list[Place]:
-        """Where picks are, and points of pairs in the first and in the second frame."""
+        """Where control points are, and points of pairs in the first and in the second frame.
+
+        As predicted, not as seen: in curves of a place that holds the noise, the noise would explain itself.
+        """
         out = []
+        poses = self.poses(self.null)
         if self.picked is not None:
             at = np.searchsorted(self.frames, self.picked.frame)
-            out.append(self._place(at, self.picked.row, self.picked.col))
+            row, col = self.picks(self.null, poses).T
+            out.append(self._place(at, self.picked.row - row, self.picked.col - col))
         if self.modes is not None:
             p = self.modes.points
+            row, col = missed(p, poses, self.null.camera)
             out.append(self._place(p.first, p.row, p.col))
-            out.append(self._place(p.second, p.row + p.row_shift, p.col + p.col_shift))
+            out.append(self._place(p.second, p.row + p.row_shift - row, p.col + p.col_shift - col))
         return out
 
     def _place(self, at: Labels, row: Array, col: Array) -> Place:

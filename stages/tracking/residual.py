@@ -166,7 +166,7 @@ class _Campaign:
             if any(c is None for c in curve_of):
                 continue
             out[name] = self._basis(places, of, curve_of, None)
-        ring = curves_of(np.concatenate([radius(p) for p in every]))
+        ring = curves_of(np.concatenate([radius(p) for p in every]), distance=True)
         if ring is not None:
             out["image radius"] = self._basis(places, lambda p: np.stack([radius(p)] * 2, -1), [ring], radial)
         return out

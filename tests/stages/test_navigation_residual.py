@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_navigation import problem, recorded
-from simulated import LEVER, MEMS, RLG
+from loop_navigation import SPAN, manoeuvres, problem, recorded
+from simulated import LEVER, MEMS, RLG, fixes
 
 from pipeline.campaign import read_campaign
 from pipeline.errors import InputError
@@ -64,7 +64,8 @@ def test_clean_innovations_are_white() -> None:
 
 
 def test_derivatives_are_those_of_exact_passes() -> None:
-    """To 1 % of their norm, all thirteen, the latency's in a vibrating body too; measured 0.02 to 0.4 %.
+    """To 1 % of their norm, measured 0.02 to 0.4 %; the latency's, of which velocities that lag are taken off anew at every point
+    of a vibrating body, to 3 %, measured 1.8 %.
 
     (With a MEMS up to 11 % for g-sensitivity: the filter linearises elsewhere then, the further the larger its innovations.)
     """
@@ -77,7 +78,8 @@ def test_derivatives_are_those_of_exact_passes() -> None:
                 2.0 if name == "latency" else 100.0
             ) * parameter.difference  # latency bends within a vibration's phase
             up, down = (at(p, **{candidate.effect: {name: sign * step}}) for sign in (1.0, -1.0))
-            assert np.linalg.norm((down - up) / (2.0 * step) - column) < 0.01 * np.linalg.norm(column), name
+            least = 0.03 if name == "latency" else 0.01
+            assert np.linalg.norm((down - up) / (2.0 * step) - column) < least * np.linalg.norm(column), name
 
 
 def test_the_residual_with_the_effect_in_the_model_is_the_clean_one() -> None:
@@ -193,6 +195,19 @@ def test_arm_and_latency_at_a_steady_speed_are_one_family() -> None:
     assert {step.effect, *step.indistinguishable_from} == {"antenna_lever_arm", "gnss_latency"}
     family = next(one for one in result.not_identifiable if len(one.effects) > 1)
     assert "several speeds" in family.would_separate
+
+
+def test_velocities_that_lag_are_no_latency() -> None:
+    """A receiver's filter makes velocities late by 40 ms: nothing is added; the clock's own latency beside it is found."""
+    imu, gnss, initial = recorded(MEMS, 0, 5, {})
+    craft, _ = manoeuvres(0)
+    velocity = fixes(craft, float(imu.time[-1]) - 0.3, np.random.default_rng(8), latency=0.04, interval=SPAN).velocity
+    for clock in (0.0, 0.03):
+        given = replace(gnss, velocity=velocity, time=gnss.time + clock)
+        p = residual_problem(imu, given, MEMS.model, Mounting(LEVER), NavigationSettings(), initial=initial)
+        result = run(p, QUICK, 1)
+        assert found(result) == (["gnss_latency"] if clock else [])
+        within(result, {"gnss_latency": {"latency": clock}})
 
 
 # --- measured and shared data ----------------------------------------------------------------------------------------
