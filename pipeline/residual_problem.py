@@ -95,7 +95,8 @@ class ResidualProblem:
                 own, and are fitted there when it is held out
     channel     (n,) samples of one channel share their noise's variances (default: all of them)
     covariates  name → (n,): what the remainder may depend on if no candidate accounts for it; NaN: not this sample
-    sigma       the white noise's standard deviation where it is known (1 for whitened innovations): more than it is structure
+    sigma       the white noise's standard deviation where it is declared, one number or (n,) with NaN where it is not: more
+                than it, and serially correlated, is structure
     floor       RMS of the residual that is the method's own accuracy: below it nothing is looked for
     unit        of the residual, for a reader
     """
@@ -109,7 +110,7 @@ class ResidualProblem:
     nuisance: Array
     channel: Labels | None = None
     covariates: Mapping[str, Array | Basis] = field(default_factory=dict)
-    sigma: float | None = None
+    sigma: float | Array | None = None
     floor: float = 0.0
     unit: str = "1"
     group_names: Mapping[int, str] = field(default_factory=dict)

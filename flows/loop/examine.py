@@ -1,5 +1,6 @@
 """The engine on one part of a campaign, as a cached step: result as JSON, the residual's pictures as NetCDF.
 
+Effects of navigation must not make fixes worse that neither path nor effects have seen: else they are taken back.
 Beside the answer it keeps, for spectral effects that were added, their parameters without each half of the groups: RQE on
 held-out targets is made with those.
 """
@@ -17,6 +18,7 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from flows.loop.problems import Part, inputs_of, picked_px, problem_of, settings_of
+from flows.loop.withheld import withheld_m, worse
 from flows.steps import Paths, Plan, plain
 from pipeline.datasets import write_dataset
 from pipeline.errors import StageError
@@ -27,6 +29,7 @@ from stages.closed_loop import LoopResult
 from tsmftis.effects import EFFECTS, nested, scalars
 
 FOLDER = "loop"
+TAKEN_BACK = "withheld fixes are missed by {0:.3g} m horizontally, {1:.3g} m vertically without it, {2:.3g} and {3:.3g} m with it"
 
 
 def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
@@ -36,7 +39,12 @@ def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
         with threadpool_limits(limits=1), _telling(part):
             problem = problem_of(plan, part)
             result = closed_loop.run(problem, plan.settings.closed_loop, seed)
+            missed = withheld_m(plan, result.values) if part.stage == "navigation" and result.values else None
+            if missed is not None and worse(missed, plan.settings.closed_loop.gain):
+                result = closed_loop.taken_back(result, TAKEN_BACK.format(*missed[0], *missed[1]))
             content = content_of(part, problem, result)
+            if part.stage == "navigation":
+                content["withheld_m"] = None if missed is None else dict(zip(("before", "after"), missed, strict=True))
             if part.stage == "geometry":
                 content["picked_px"] = picked_px(plan, result.values)
         write_json(to["result"], content)

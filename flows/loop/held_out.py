@@ -15,23 +15,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from flows.loop.problems import Part, flight_of, inputs_of, lines_of, picked_px, problem_of, settings_of
+from flows.loop.problems import Part, inputs_of, lines_of, picked_px, settings_of
 from flows.results import SCORES
 from flows.steps import Paths, Plan, plain, turn_on
 from pipeline.model_update import Effects
 from pipeline.records import Tracks
 from pipeline.run_stage import StageRecord, run_stage, write_json
-from stages import closed_loop, navigation, reconstruction, scoring, thermal
+from stages import closed_loop, reconstruction, scoring, thermal
 from tsmftis.effects import nested, scalars
 
-WITHHELD_S = (30.0, 5.0)
 FIT_ON = {
     "rqe_tracking_mean": "no target takes part in what was fitted",
     "geometry_residual_px": "each group of control points predicted from all others",
@@ -70,9 +68,10 @@ def held_out_step(root: Path, before: Plan, last: Plan, answers: Answers, runs: 
                 second.update(_thermal(last, answers["thermal"]["effects"]))
                 how["thermal_gyro_std_deg_per_h"] = "verification runs, with effects from the training runs alone"
             if "navigation" in added:
-                missed = _withheld(last, {n: dict(v) for n, v in answers["navigation"]["effects"].items()})
+                missed = answers["navigation"]["withheld_m"]
                 if missed is not None:
-                    first["navigation_withheld_m"], second["navigation_withheld_m"] = missed
+                    for figures, when in ((first, "before"), (second, "after")):
+                        figures["navigation_withheld_m"] = missed[when]
                     how["navigation_withheld_m"] = (
                         "5 of every 30 s of the fixes, withheld from the path and from the effects"
                     )
@@ -145,31 +144,6 @@ def flat(effects: Effects) -> dict[str, dict[str, float]]:
         each = {s: values[key]["xyz".index(s[-1])] if s != key else values[key] for s, key in scalars(name).items()}
         out[name] = {scalar: float(v) for scalar, v in each.items() if v}
     return out
-
-
-def _withheld(plan: Plan, effects: Effects) -> tuple[list[float], list[float]] | None:
-    """RMS of the smoothed antenna's misses [m] before and after, horizontal and vertical, over the fixes of all flights; None
-    where none could be withheld."""
-    settings = plan.settings.navigation.model_copy(update={"withhold_every_s": WITHHELD_S})
-    rest = {n: v for n, v in plan.update.effects.items() if n not in effects}
-    plan = replace(
-        plan,
-        settings=plan.settings.model_copy(update={"navigation": settings}),
-        update=replace(plan.update, effects=rest),
-    )
-    found = closed_loop.refit(problem_of(plan, Part("navigation")), effects)
-    missed = []
-    for model in ({}, found):
-        squares, fixes = np.zeros(2), 0
-        for flight in plan.opened.keys.flights:
-            one = navigation.run(**flight_of(plan, flight.id), effects=model).quality["withheld"]
-            if one["fixes"]:
-                fixes += one["fixes"]
-                squares += one["fixes"] * np.array([one["horizontal_rms_m"], one["vertical_rms_m"]]) ** 2
-        if not fixes:
-            return None
-        missed.append(np.sqrt(squares / fixes).tolist())
-    return missed[0], missed[1]
 
 
 def _spectral(plan: Plan, halves: list[Mapping[str, Any]], run: Figures, first: Figures, second: Figures) -> str:

@@ -5,7 +5,7 @@ It knows no stage: a `ResidualProblem` comes in (pipeline/residual_problem.py).
 """
 
 from stages.closed_loop.engine import refit, run
-from stages.closed_loop.result import LoopResult, Step, Value
+from stages.closed_loop.result import LoopResult, Step, Value, taken_back
 from stages.closed_loop.settings import LoopSettings
 
-__all__ = ["LoopResult", "LoopSettings", "Step", "Value", "refit", "run"]
+__all__ = ["LoopResult", "LoopSettings", "Step", "Value", "refit", "run", "taken_back"]

@@ -66,10 +66,10 @@ class Confirmation:
     without_best: float = 0.0
 
     def passes(self, gain: float, decisive: float) -> bool:
-        enough = self.folds >= FEWEST_FOLDS and self.without_best > 0.0
-        likelier = enough and self.log_likelihood >= decisive and self.gain > -gain
-        better = self.gain >= gain or likelier
-        return better and self.same_sign and 2 * self.chosen > self.folds
+        enough = self.folds >= FEWEST_FOLDS
+        likelier = enough and self.without_best > 0.0 and self.log_likelihood >= decisive and self.gain > -gain
+        smaller = self.gain >= gain and not (enough and self.log_likelihood < -decisive)
+        return (smaller or likelier) and self.same_sign and 2 * self.chosen > self.folds
 
 
 def folds_of(group: NDArray[np.int64]) -> list[Index]:

@@ -40,7 +40,8 @@ CHANGES = 0.1  # of an effect's χ²
 IS_CURVE = (
     0.05  # of a term's norm, left beside the curves of a covariate: it is one of them, but for rounding and perspective
 )
-EXCESS = 1.1  # RMS over a known sigma that is structure
+EXCESS = 1.1  # RMS over a known sigma that is more than noise
+LAGS = 8  # samples apart, over which it is looked at for structure
 
 
 @dataclass(frozen=True)
@@ -130,12 +131,16 @@ def _seal(problem: ResidualProblem, settings: LoopSettings, rng: np.random.Gener
     return every[problem.group != sealed], sealed
 
 
-def _rms(layout: Layout, state: State) -> float:
-    """Of what the model's columns leave, by least squares."""
+def _left(layout: Layout, state: State) -> Array:
+    """What the model's columns leave (rows,), by least squares."""
     columns, data = state.columns[layout.rows], state.residual[layout.rows]
     if columns.shape[1]:
         data = data - columns @ np.linalg.lstsq(columns, data, rcond=None)[0]
-    return float(np.sqrt(np.mean(data**2)))
+    return np.asarray(data)
+
+
+def _rms(layout: Layout, state: State) -> float:
+    return float(np.sqrt(np.mean(_left(layout, state) ** 2)))
 
 
 def _first_look(
@@ -564,15 +569,15 @@ def _close(
             steps, values, rms_after = [], {}, rms_before
             state.refused |= {s.effect: f"taken back: the sealed group {name} is worse with it" for s in state.steps}
             state.estimate, state.residual, state.nuisance = None, null, before.columns
-    if problem.sigma is not None:
-        rms = _rms(layout, state)
-        excess = (rms / problem.sigma) ** 2 * rows.size
-        if rms > EXCESS * problem.sigma and chdtrc(rows.size - state.columns.shape[1], excess) < CERTAIN:
-            told = f"what is left is {rms / problem.sigma:.3g} times the declared sigma"
-            if steps:
-                told += ": something more is missing, or what was added stands for something else"
-            state.notes.append(told)
+    if (excess := _excess(problem, layout, state)) is not None:
+        rms, correlated = excess
+        told = f"what is left is {rms:.3g} times the declared sigma"
+        if not correlated:
+            told += ", and white: the noise is larger than declared"
+        else:
+            told += ": something more is missing, or what was added stands for something else" if steps else ""
             state.certain.append("excess")
+        state.notes.append(told)
     families = [
         identifiability.Limit(
             (s.effect, *s.indistinguishable_from), f"either explains the data: {s.evidence.rsplit('; ', 1)[-1]}",
@@ -599,6 +604,28 @@ def _close(
         tuple(replace(c, outcome=_outcome(c.effect, steps, state)) for c in considered.values()),
         _pictures(problem, state, null, noise),
     )
+
+
+def _excess(problem: ResidualProblem, layout: Layout, state: State) -> tuple[float, bool] | None:
+    """RMS of what is left over the declared sigma, of the samples that have one, and whether it is serially correlated, which
+    makes it structure and no noise that is larger than declared. None where it is no more than noise can be.
+
+    Portmanteau: Σ_k m_k·ρ_k² ~ χ²_LAGS of white noise, ρ_k over the m_k pairs of samples k apart in a series.
+    """
+    sigma = np.broadcast_to(np.nan if problem.sigma is None else problem.sigma, problem.group.shape)[layout.rows]
+    known = np.isfinite(sigma)
+    z = np.where(known, _left(layout, state) / np.where(known, sigma, 1.0), 0.0)
+    count, power = int(known.sum()), float(z @ z)
+    if count <= state.columns.shape[1] or power <= EXCESS**2 * count:
+        return None
+    if chdtrc(count - state.columns.shape[1], power) >= CERTAIN:
+        return None
+    series, total = problem.series[layout.rows], 0.0
+    for k in range(1, LAGS + 1):
+        pairs = (series[k:] == series[:-k]) & known[k:] & known[:-k]
+        if pairs.any():
+            total += pairs.sum() * float((z[k:] * z[:-k])[pairs].sum() / power * count / pairs.sum()) ** 2
+    return float(np.sqrt(power / count)), bool(chdtrc(LAGS, total) < CERTAIN)
 
 
 def _outcome(effect: str, steps: Sequence[Step], state: State) -> str:

@@ -1,9 +1,12 @@
-"""What the loop answers for one stage: the parts of loop.json that are its own, and what a person reads."""
+"""What the loop answers for one stage: the parts of loop.json that are its own, and what a person reads.
+
+`taken_back` is the answer once what was added has failed on data that the engine does not have.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -121,3 +124,19 @@ class LoopResult:
             ],
             "notes": list(self.notes),
         }
+
+
+def taken_back(result: LoopResult, why: str) -> LoopResult:
+    """Without its steps: something is there, and what was added is not it."""
+    names = [step.effect for step in result.steps]
+    outcome = f"taken back: {why}"
+    return replace(
+        result,
+        verdict="unexplained",
+        steps=(),
+        values={},
+        rms_after=result.rms_before,
+        notes=(*result.notes, f"{', '.join(names)} taken back: {why}"),
+        considered=tuple(replace(c, outcome=outcome) if c.effect in names else c for c in result.considered),
+        pictures=Pictures(result.pictures.before, result.pictures.before, {}),
+    )

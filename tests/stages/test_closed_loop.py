@@ -17,7 +17,7 @@ from pipeline.records import Bench
 from pipeline.residual_problem import Basis, Candidate, Parameter, Parameters, ResidualProblem
 from stages.bench import BenchSettings, residual_problem
 from stages.bench import run as bench_stage
-from stages.closed_loop import LoopSettings, run
+from stages.closed_loop import LoopSettings, run, taken_back
 from stages.closed_loop.confirmation import controls, controls_fail
 from stages.closed_loop.learned import knots, spline_columns
 from stages.closed_loop.noise import Colour, Layout, basis, criterion, fit_noise, gram, log_det
@@ -242,14 +242,29 @@ def test_a_channel_of_a_single_sample_has_a_likelihood() -> None:
     assert gram(layout, noise, np.ones((12, 1)))[0, 0] > 0.25 and np.isfinite(log_det(layout, noise))
 
 
-def test_neither_name_nor_covariate_ends_unexplained() -> None:
-    """A known sigma that is exceeded by white structure of nothing that is offered."""
-    rng = np.random.default_rng(6)
-    columns = {"a": rng.standard_normal(360)}
-    y = rng.standard_normal(360) * 1.5
-    result = run(simple(y, columns, sigma=1.0, covariates={"b": rng.standard_normal(360)}), QUICK, 1)
-    assert result.verdict == "unexplained" and result.steps == () and "declared sigma" in result.notes[-1]
-    assert run(simple(y, columns, sigma=1.5), QUICK, 1).verdict == "no_effect"
+def test_more_than_the_declared_noise_is_structure_where_it_is_correlated() -> None:
+    """Twice the noise is a declaration that is wrong; a wander of the same size is something that the model lacks."""
+    rng = np.random.default_rng(12)
+    time = np.tile(np.arange(40.0), 6)
+    white = 2.0 * rng.standard_normal(240)
+    wander = rng.standard_normal(240) + 2.5 * np.sin(time / 3.0 + np.repeat(rng.uniform(0.0, 6.0, 6), 40))
+    for y, verdict in ((white, "no_effect"), (wander, "unexplained"), (0.5 * white, "no_effect")):
+        result = run(simple(y, {"a": rng.standard_normal(240)}, sigma=1.0), QUICK, 1)
+        assert result.verdict == verdict
+        assert ("times the declared sigma" in " ".join(result.notes)) == (np.std(y) > 1.5)
+    half = np.where(time < 20.0, np.nan, 1.0)  # of which nothing is declared, nothing is said
+    quiet = np.where(time < 20.0, wander, 0.5 * white)
+    assert run(simple(quiet, {"a": rng.standard_normal(240)}, sigma=half), QUICK, 1).verdict == "no_effect"
+
+
+def test_an_answer_that_fails_on_other_data_is_taken_back() -> None:
+    rng = np.random.default_rng(4)
+    x = rng.standard_normal(240)
+    result = run(simple(2.0 * x + rng.standard_normal(240), {"a": x}), QUICK, 1)
+    assert result.verdict == "effects_added"
+    back = taken_back(result, "elsewhere it does harm")
+    assert (back.verdict, back.steps, back.values) == ("unexplained", (), {})
+    assert back.rms_after == back.rms_before and back.considered[0].outcome == "taken back: elsewhere it does harm"
 
 
 def test_two_effects_at_once() -> None:

@@ -1,0 +1,53 @@
+"""What effects of navigation's model are worth on fixes that neither path nor effects have seen.
+
+Functions
+---------
+withheld_m    misses of withheld fixes without the effects and with them
+worse         whether they grew
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from flows.loop.problems import Part, flight_of, problem_of
+from flows.steps import Plan
+from pipeline.residual_problem import Parameters
+from stages import closed_loop, navigation
+
+WITHHELD_S = (30.0, 5.0)
+Misses = tuple[list[float], list[float]]
+
+
+def withheld_m(plan: Plan, effects: Parameters) -> Misses | None:
+    """RMS of the smoothed antenna's misses [m] before and after, horizontal and vertical, over the fixes of all flights; None
+    where none could be withheld. `effects` by their scalar names; those of `plan` are in the model already, before and after."""
+    settings = plan.settings.navigation.model_copy(update={"withhold_every_s": WITHHELD_S})
+    rest = {n: v for n, v in plan.update.effects.items() if n not in effects}
+    plan = replace(
+        plan,
+        settings=plan.settings.model_copy(update={"navigation": settings}),
+        update=replace(plan.update, effects=rest),
+    )
+    found = closed_loop.refit(problem_of(plan, Part("navigation")), {n: dict(v) for n, v in effects.items()})
+    missed = []
+    for model in ({}, found):
+        squares, fixes = np.zeros(2), 0
+        for flight in plan.opened.keys.flights:
+            one = navigation.run(**flight_of(plan, flight.id), effects=model).quality["withheld"]
+            if one["fixes"]:
+                fixes += one["fixes"]
+                squares += one["fixes"] * np.array([one["horizontal_rms_m"], one["vertical_rms_m"]]) ** 2
+        if not fixes:
+            return None
+        missed.append(np.sqrt(squares / fixes).tolist())
+    return missed[0], missed[1]
+
+
+def worse(missed: Misses, share: float) -> bool:
+    """Whether misses (before, after) grew by more than a share, all three components together."""
+    before, after = (math.hypot(*one) for one in missed)
+    return after > (1.0 + share) * before
