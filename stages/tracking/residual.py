@@ -311,6 +311,7 @@ def residual_problem(
         nuisance=np.zeros((order.size, 0)),
         channel=made.channel[order],
         covariates=made.covariates(),
+        sigma=1.0,
         unit="sigma",
         group_names=names,
     )

@@ -110,6 +110,14 @@ def test_a_latency_is_found_with_its_sigma_and_held_out() -> None:
     assert after == pytest.approx(0.3, abs=0.05) and after < 0.95 * before
 
 
+def test_more_than_the_declared_noise_is_not_nothing() -> None:
+    """Twice the variance, of no effect's shape: unexplained, whatever noise it could be."""
+    problem = problem_of(flown(two_lines(), 8, {}))
+    more = np.random.default_rng(3).standard_normal(problem.group.size)
+    result = run(replace(problem, residual=lambda effects: problem.residual(effects) + more), LoopSettings(), 1)
+    assert result.verdict == "unexplained" and any("times the declared sigma" in note for note in result.notes)
+
+
 def test_without_its_name_a_latency_is_a_curve_of_the_angular_rate() -> None:
     made = flown(two_lines(), 10, {"camera_latency": {"latency": 0.002}})
     problem = problem_of(made)
