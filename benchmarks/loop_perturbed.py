@@ -38,6 +38,7 @@ from perturbations import (
     g_sensitive,
     halved,
     hysteretic,
+    no_velocity,
     one_reference,
     outlier_track,
     rows_moved,
@@ -109,12 +110,14 @@ CASES: dict[str, tuple[list[Change], Truth]] = {
     "outliers": ([outlier_track], {}),
     "thermometer": ([partial(IMU, partial(warmer, 3.0))], {}),
     # cut down
+    "no-velocities": ([partial(GNSS, no_velocity)], {}),
     **{name: ([partial(campaign, partial(without, what))], {}) for name, what in CUTS.items()},
     **{f"gnss-{h}-half": ([partial(GNSS, partial(halved, h == "first"))], {}) for h in ("first", "second")},
 }  # fmt: skip
 COMBINED = (
     ("arm-x", "camera+4ms"), ("boresight-pitch", "camera+4ms"), ("opd-scale", "nonlinear"), ("gnss+60ms", "opd-scale"),
-    ("focal", "k1"), ("gnss+100ms", "gnss-first-half"), ("gnss+100ms", "gnss-second-half"), ("arm-z", "gnss-20ms"),
+    ("focal", "k1"), ("gnss+100ms", "gnss-first-half"), ("gnss+100ms", "gnss-second-half"), ("gnss+100ms", "no-velocities"),
+    ("arm-z", "gnss-20ms"),
     ("hysteresis", "boresight-roll"),
 )  # fmt: skip
 CASES |= {

@@ -124,6 +124,11 @@ def velocity_lag(seconds: float, d: xr.Dataset) -> None:
         d.velocity.values[:, axis] = np.interp(d.time.values - seconds, d.time.values, d.velocity.values[:, axis])
 
 
+def no_velocity(d: xr.Dataset) -> xr.Dataset:
+    """Positions alone."""
+    return d.drop_vars(["velocity", "sigma_velocity"])
+
+
 def east(metres: float, d: xr.Dataset) -> None:
     """Every fix to the east."""
     d.longitude.values[:] += metres / (111.32e3 * np.cos(np.deg2rad(d.latitude.values)))
