@@ -151,10 +151,11 @@ def one_reference(factor: float, d: xr.Dataset) -> None:
 
 
 def outlier_track(folder: Path) -> None:
-    """Every sixth control point is 9 rows away from where it was."""
+    """Every sixth control point is 9 rows towards the middle from where it was."""
     for path in sorted(folder.glob("*/*_gcps.csv")):
         points = pd.read_csv(path, dtype=str)
-        points["row"] = points.row.astype(float) + np.where(np.arange(len(points)) % 6 == 0, 9.0, 0.0)
+        row = points.row.astype(float)
+        points["row"] = row + np.where(np.arange(len(points)) % 6 == 0, np.where(row > 40, -9.0, 9.0), 0.0)
         points.to_csv(path, index=False)
 
 
