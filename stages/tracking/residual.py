@@ -311,9 +311,8 @@ def residual_problem(
         nuisance=np.zeros((order.size, 0)),
         channel=made.channel[order],
         covariates=made.covariates(),
-        sigma=np.where(made.channel < 2, 1.0, np.nan)[
-            order
-        ],  # of picks it is declared; of images' motion it is a guess
+        # Of picks it is declared; of the images' motion it is a guess.
+        sigma=np.where(made.channel < 2, 1.0, np.nan)[order],
         unit="sigma",
         group_names=names,
     )

@@ -110,6 +110,16 @@ def test_a_latency_is_found_with_its_sigma_and_held_out() -> None:
     assert after == pytest.approx(0.3, abs=0.05) and after < 0.95 * before
 
 
+def test_points_off_by_more_than_their_sigma_are_not_nothing() -> None:
+    """One line's points two pixels off in row, of no effect's shape: unexplained."""
+    made = flown(two_lines(), 8, {})
+    gcps = made.lines[1].gcps
+    assert gcps is not None
+    off = [made.lines[0], replace(made.lines[1], gcps=replace(gcps, row=gcps.row + 2.0))]
+    result = run(problem_of(replace(made, lines=off)), LoopSettings(), 1)
+    assert result.verdict == "unexplained" and any("times the declared sigma" in note for note in result.notes)
+
+
 def test_without_its_name_a_latency_is_a_curve_of_the_angular_rate() -> None:
     made = flown(two_lines(), 10, {"camera_latency": {"latency": 0.002}})
     problem = problem_of(made)
