@@ -99,6 +99,7 @@ class ResidualProblem:
                 than it, and serially correlated, is structure
     floor       RMS of the residual that is the method's own accuracy: below it nothing is looked for
     unit        of the residual, for a reader
+    notes       what a reader must be told of the data, such as what was left out
     """
 
     stage: str
@@ -114,6 +115,7 @@ class ResidualProblem:
     floor: float = 0.0
     unit: str = "1"
     group_names: Mapping[int, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = self.group.size

@@ -17,12 +17,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from flows.steps import Plan, compensation, initial_attitude, naming, needed, plain
-from pipeline.errors import StageError
+from pipeline.errors import StageError, TsmftisError
 from pipeline.raster import Dem
 from pipeline.records import Tracks, Trajectory
 from pipeline.residual_problem import Parameters, ResidualProblem, joined
@@ -171,14 +171,22 @@ def flight_of(plan: Plan, flight: str) -> dict[str, Any]:
 
 
 def _navigation(plan: Plan) -> ResidualProblem:
-    campaign, problems = plan.opened, {}
+    """Of the flights whose files can serve; the others are named in its notes."""
+    campaign, problems, failed = plan.opened, {}, {}
     for flight in campaign.keys.flights:
         files = {"gnss": campaign.path(flight.gnss), "imu": campaign.path(flight.imu)}
-        with naming(**files, **{"campaign.yaml": campaign.root / "campaign.yaml"}):
-            problems[flight.id] = navigation.residual_problem(
-                **flight_of(plan, flight.id), effects=plan.effects("navigation")
-            )
-    return joined(problems)
+        try:
+            with naming(**files, **{"campaign.yaml": campaign.root / "campaign.yaml"}):
+                problems[flight.id] = navigation.residual_problem(
+                    **flight_of(plan, flight.id), effects=plan.effects("navigation")
+                )
+        except TsmftisError as error:
+            failed[flight.id] = error
+    if not problems:
+        raise next(iter(failed.values()))
+    return replace(
+        joined(problems), notes=tuple(f"flight {name} was not looked at: {error}" for name, error in failed.items())
+    )
 
 
 def geometry_of(plan: Plan, motion: bool = True) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,13 @@ import xarray as xr
 import yaml
 from tiny_campaign import tiny_campaign
 
+from flows.loop import problems
+from flows.loop.problems import Part
 from pipeline.datasets import write_dataset
+from pipeline.errors import InputError
 from pipeline.model_update import read_model_update
 from pipeline.records import Bench
+from pipeline.residual_problem import ResidualProblem
 from stages import bench as bench_stage
 
 HEAD = {
@@ -169,3 +174,35 @@ def test_wrong_input_ends_in_one_line(laboratory: Path, tmp_path: Path, tsmftis:
         answer = tsmftis("close-loop", *arguments)
         assert answer.code == 2 and part in answer.err and answer.err.count("\n") == 1, answer.err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_flight_that_cannot_serve_leaves_the_others_their_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its reason is told with the answer; where no flight can, it is the answer."""
+    good = ResidualProblem(
+        "navigation", lambda _: np.ones(4), (), *(np.arange(4) for _ in range(2)), np.arange(4.0), np.zeros((4, 0))
+    )
+
+    def of(imu: str, **_: Any) -> ResidualProblem:
+        if imu == "F2":
+            raise InputError("gnss", "variable 'time'", "leaves 3 usable fixes", "record more")
+        return good
+
+    class Campaign:
+        root = Path()
+
+        def __init__(self, *names: str) -> None:
+            self.keys = SimpleNamespace(
+                flights=[SimpleNamespace(id=n, gnss=f"{n}.nc", imu=f"{n}-imu.nc") for n in names]
+            )
+
+        def path(self, name: str) -> Path:
+            return Path(name)
+
+    monkeypatch.setattr(problems.navigation, "residual_problem", of)
+    monkeypatch.setattr(problems, "flight_of", lambda _, flight: {"imu": flight})
+    plans = [SimpleNamespace(opened=Campaign(*names), effects=lambda _: {}) for names in (("F1", "F2"), ("F2",))]
+    made = problems.problem_of(plans[0], Part("navigation"))  # type: ignore[arg-type]
+    assert made.group.size == 4 and len(made.notes) == 1
+    assert made.notes[0].startswith("flight F2 was not looked at: F2.nc: variable 'time': leaves 3")
+    with pytest.raises(InputError, match="3 usable fixes"):
+        problems.problem_of(plans[1], Part("navigation"))  # type: ignore[arg-type]
