@@ -229,7 +229,9 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
         "frames": campaign.path(entry.frames),
         "targets": campaign.path(entry.targets),
     }
-    if drifts := "boresight_thermal_drift" in effects:
+    learned = tracking.applied(plan.update.learned)
+    warm = "boresight_thermal_drift" in effects or any(one["covariate"] == "temperature" for one in learned)
+    if warm:
         inputs["imu"] = campaign.path(campaign.flight(flight).imu)
     if plan.truth is not None and (path := true_poses_file(plan.truth, line)) is not None:
         inputs["truth"] = path
@@ -246,8 +248,9 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
                 instrument.mounting,
                 plan.settings.tracking,
                 read_true_poses(inputs["truth"], stamps.size) if "truth" in inputs else None,
-                campaign.imu(flight).temperatures if drifts else None,
+                campaign.imu(flight).temperatures if warm else None,
                 effects,
+                learned,
             )
         write_dataset(result.tracks.to_dataset(), to["tracks"])
         write_dataset(result.poses.to_dataset(), to["poses"])
@@ -266,6 +269,7 @@ def tracking_step(plan: Plan, flight: str, line: str) -> StageRecord:
         {
             "settings": plain(plan.settings.tracking),
             "effects": effects,
+            "learned": plain(learned),
             "camera": plain(instrument.camera),
             "mounting": plain(instrument.mounting),
         },

@@ -11,7 +11,9 @@
 
 Names, parameters and units are those of `tsmftis.effects`; a parameter left out is zero, one of three axes a list of three.
 A laboratory interferogram that `bench` names has its own effects and not those of `effects`: its detector is another one.
-Learned terms are what the closed loop found without a name: curves of what is left over a covariate. No model applies them.
+Learned terms are what the closed loop found without a name: curves of what is left over a covariate. Those of the geometry that
+are curves of what a frame is under (time, temperature, attitude, …) turn the camera (`stages.tracking.learned`); no model
+applies the others, which are on record.
 
 Functions
 ---------

@@ -25,7 +25,7 @@ from flows.campaign import Graph, Listener, run_flow
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 
-from flows.loop.examine import examine_step
+from flows.loop.examine import examine_step, learned_of
 from flows.loop.held_out import Answers, held_out_step
 from flows.loop.problems import NothingThere, Part, lines_of, parts_of
 from flows.results import assemble, write_run
@@ -33,6 +33,7 @@ from flows.steps import Plan, reaches
 from pipeline.errors import StageError, TsmftisError
 from pipeline.model_update import ModelUpdate, write_model_update
 from pipeline.run_stage import StageRecord, write_json
+from stages import tracking
 from tsmftis import __version__
 
 SCHEMA = "tsmftis-loop/1"
@@ -81,8 +82,8 @@ def close_loop_flow(plan: Plan, seed: int) -> Closed:
     update, answers = ModelUpdate(), {}
     made = records
     for part in parts:
-        now = replace(after, update=update) if update.effects else before
-        if update.effects and part.needs is not None:
+        now = replace(after, update=update) if _changes(update) else before
+        if _changes(update) and part.needs is not None:
             _take_over(before.out, after.out)
             records += (made := _campaign(now, upto=part.needs))
         if failed := _failed(made, part):
@@ -102,7 +103,7 @@ def close_loop_flow(plan: Plan, seed: int) -> Closed:
         raise problem or StageError("; ".join(f"{name}: {why}" for name, why in missing.items()))
     write_model_update(update, root / UPDATE)
     second, last = first, before
-    if update.effects or any(update.bench.values()):
+    if _changes(update) or any(update.bench.values()):
         _take_over(before.out, after.out)
         last = replace(after, update=update)
         records += (done := _campaign(last))
@@ -165,6 +166,11 @@ def _take_over(before: Path, after: Path) -> None:
             shutil.copy2(path, to)
 
 
+def _changes(update: ModelUpdate) -> bool:
+    """Whether it changes what a run over the campaign makes of its flights."""
+    return bool(update.effects or tracking.applied(update.learned))
+
+
 def _with(update: ModelUpdate, part: Part, answer: dict[str, Any], alone: bool) -> ModelUpdate:
     """The update with what a part's model was found to lack. A bench interferogram has effects of its own, unless it is the only
     one that the campaign has, and there are no lines."""
@@ -172,17 +178,7 @@ def _with(update: ModelUpdate, part: Part, answer: dict[str, Any], alone: bool) 
         name: {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         for name, values in answer["effects"].items()
     }
-    learned = tuple(
-        {
-            "stage": step["stage"],
-            "covariate": step["effect"].removeprefix("learned:"),
-            "unit": answer["heldout_rms"]["unit"],
-            "table": step["table"],
-        }
-        for step in answer["steps"]
-        if "table" in step
-    )
-    update = replace(update, learned=(*update.learned, *learned))
+    update = replace(update, learned=(*update.learned, *learned_of(answer)))
     if part.bench is not None and not alone:
         return replace(update, bench={**update.bench, part.bench: effects})
     return replace(update, effects={**update.effects, **effects})

@@ -24,7 +24,7 @@ from pipeline.datasets import write_dataset
 from pipeline.errors import StageError
 from pipeline.residual_problem import Basis, ResidualProblem
 from pipeline.run_stage import StageRecord, run_stage, write_json
-from stages import closed_loop
+from stages import closed_loop, tracking
 from stages.closed_loop import LoopResult
 from tsmftis.effects import EFFECTS, nested, scalars
 
@@ -46,7 +46,11 @@ def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
             if part.stage == "navigation":
                 content["withheld_m"] = None if missed is None else dict(zip(("before", "after"), missed, strict=True))
             if part.stage == "geometry":
-                content["picked_px"] = picked_px(plan, result.values)
+                learned = [one["covariate"] for one in tracking.applied(learned_of(content))]
+                content["picked_px"] = picked_px(plan, result.values, learned)
+                for step in content["steps"]:
+                    if "table" in step:
+                        step["applied"] = step["effect"].removeprefix("learned:") in learned
         write_json(to["result"], content)
         write_dataset(pictures_of(problem, result), to["pictures"])
         return content
@@ -96,6 +100,20 @@ def content_of(part: Part, problem: ResidualProblem, result: LoopResult) -> dict
         "effects": plain(nested(result.values)),
         "without": _refits(problem, result) if part == Part("spectral") else [],
     }
+
+
+def learned_of(answer: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
+    """The curves that an answer adds, as a model update has them."""
+    return tuple(
+        {
+            "stage": step["stage"],
+            "covariate": step["effect"].removeprefix("learned:"),
+            "unit": answer["heldout_rms"]["unit"],
+            "table": step["table"],
+        }
+        for step in answer["steps"]
+        if "table" in step
+    )
 
 
 def _known(value: float) -> float | None:

@@ -16,7 +16,7 @@ settings_of   the settings that it hangs on
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -230,10 +230,11 @@ def _geometry(plan: Plan) -> ResidualProblem:
     return made
 
 
-def picked_px(plan: Plan, found: Parameters) -> dict[str, float] | None:
-    """RMS of the control points [px] without `found`, and with it, each group predicted from the others; None without such
-    points."""
-    before, after = tracking.geometry_residual_px(**geometry_of(plan, motion=bool(found)), found=found)
+def picked_px(plan: Plan, found: Parameters, learned: Sequence[str] = ()) -> dict[str, float] | None:
+    """RMS of the control points [px] without `found` and curves of the `learned` covariates, and with them, each group predicted
+    from the others; None without such points."""
+    made = geometry_of(plan, motion=bool(found or learned))
+    before, after = tracking.geometry_residual_px(**made, found=found, learned=learned)
     return {"before": before, "after": after} if math.isfinite(before) else None
 
 

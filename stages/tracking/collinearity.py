@@ -2,12 +2,13 @@
 
 p_camera = C_camera→ECEFᵀ·(P_point − P_camera), then the camera's projection. The pose is taken at the frame's true time,
 stamp − latency, by splines through the trajectory. Effects of a model update change camera and mounting; a boresight that
-drifts is that of the frame's temperature, a mount that bends follows the unit's angular acceleration.
+drifts is that of the frame's temperature, a mount that bends follows the unit's angular acceleration. What the closed loop has
+learnt without a name turns the camera from frame to frame (`stages.tracking.learned`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from scipy.interpolate import CubicHermiteSpline
 from pipeline.errors import InputError, StageError
 from pipeline.records import DATA_GAP, CameraPoses, Targets, Temperatures, Tracks, Trajectory
 from pipeline.truth import TruePoses
+from stages.tracking.learned import Learned, turned
 from tsmftis.camera import Camera, Mounting, angular_acceleration, camera_pose
 from tsmftis.effects import refuse_others
 from tsmftis.geodesy import ecef_to_geodetic, geodetic_to_ecef, ned_to_ecef_dcm, radii_of_curvature
@@ -62,19 +64,30 @@ def run(
     truth: TruePoses | None = None,
     temperatures: Temperatures | None = None,
     effects: Mapping[str, Mapping[str, float]] | None = None,
+    learned: Sequence[Learned] = (),
 ) -> TrackingResult:
     """Tracks of every point of every target through the frames with these time stamps [s]; by true poses too, if given.
 
-    `effects` of the stage geometry are what a model update adds to camera and mounting; `temperatures` are the unit's, which a
-    boresight that drifts needs. Raises InputError where the frames lie outside the trajectory or a target lies nowhere near the
-    line, or where temperatures are needed and missing.
+    `effects` of the stage geometry are what a model update adds to camera and mounting, `learned` its curves that
+    `learned.applied` has chosen; `temperatures` are the unit's, which a boresight that drifts needs. Raises InputError where the
+    frames lie outside the trajectory or a target lies nowhere near the line, or where temperatures are needed and missing.
     """
     refuse_others(effects or {}, "geometry")
     camera, mounting = camera.with_effects(effects or {}), mounting.with_effects(effects or {})
     time = stamps - camera.latency
-    moved = Condition.at(time, trajectory, mounting, temperatures)
+    curves_of = {one["covariate"] for one in learned}
+    asked = replace(
+        mounting,
+        drift=np.ones(3) if "temperature" in curves_of else mounting.drift,
+        flexure=np.ones(2) if "angular acceleration" in curves_of else mounting.flexure,
+    )
+    moved = Condition.at(time, trajectory, asked, temperatures)
     events = poses_at(trajectory, time)
-    poses = camera_poses(events, mounting, moved)
+
+    def as_learned(poses: CameraPoses) -> CameraPoses:
+        return turned(poses, events, moved.temperature, moved.acceleration, camera, learned)
+
+    poses = as_learned(camera_poses(events, mounting, moved))
     inside = np.isfinite(poses.centre[:, 0])
     if inside.sum() < 2:
         raise InputError(
@@ -111,7 +124,7 @@ def run(
     nominal = nominal_track(row, col, time, camera, speed, float(np.nanmean(distance_down(points, poses))))
     tracks = Tracks(("nominal", "tracking"), targets.ids, np.stack([nominal[0], row]), np.stack([nominal[1], col]))
     if truth is not None:
-        row, col = project(points, true_camera(time, truth, mounting, moved), camera)
+        row, col = project(points, as_learned(true_camera(time, truth, mounting, moved)), camera)
         tracks = tracks.joined(Tracks(("true",), targets.ids, row[None], col[None]))
     return TrackingResult(tracks, poses, events, course, speed, float(np.nanmean(distance_down(points, poses))))
 
@@ -136,8 +149,8 @@ class Condition:
                 raise InputError(
                     "imu",
                     "temperature_accel",
-                    "is missing, and boresight_thermal_drift turns the camera by it",
-                    "record temperatures, or leave that effect out of the model update",
+                    "is missing, and the model update turns the camera by it",
+                    "record temperatures, or leave boresight_thermal_drift and curves of temperature out of the model update",
                 )
             temperature = np.interp(time, temperatures.time, temperatures.accel.mean(axis=1))
         if mounting.flexure.any():

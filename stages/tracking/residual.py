@@ -117,6 +117,19 @@ class _Campaign:
     def residual(self, effects: Parameters) -> Array:
         return np.asarray(self.whiten(self.raw(effects))[self.order])
 
+    def displaced(self, bases: Sequence[Basis], beta: Array) -> Array:
+        """[px] (pick, 2) that curves with coefficients (q,), basis after basis, move the picks."""
+        picks = int((self.channel == 0).sum())
+        out, begun = np.zeros((picks, 2)), 0
+        for basis in bases:
+            own = beta[begun : begun + basis.columns.shape[1]]
+            begun += own.size
+            value = np.empty(self.count)
+            value[self.order] = basis.values
+            for axis, name in enumerate(("row_px", "column_px")):
+                out[:, axis] += np.interp(value[self.channel == axis], basis.at, basis.curves[name] @ own)
+        return out
+
     def picks(self, effects: Parameters) -> Array:
         """[px] (pick, 2), in the order of the rows of the channels 0 and 1."""
         geometry = self.null.plus(effects)
@@ -327,30 +340,51 @@ def geometry_residual_px(
     settings: GeometrySettings | None = None,
     effects: Effects | None = None,
     gyro: SensorModel | None = None,
+    learned: Sequence[str] = (),
 ) -> tuple[float, float]:
-    """RMS of control points [px], per coordinate, without `found` and with; NaN where there are none.
+    """RMS of control points [px], per coordinate, without `found` and curves of the `learned` covariates, and with; NaN where
+    there are none.
 
     With: each group is predicted by the effects' values as all other groups give them (one Gauss–Newton step from `found`, which
-    has seen all), so that no point is held against a fit of its own.
+    has seen all), and by curves fitted to those, so that no point is held against a fit of its own.
     """
     made = _Campaign(lines, camera, mounting, dem, settings or GeometrySettings(), effects or {}, gyro)
     if made.count == 0 or not (made.channel < 2).any():
         return float("nan"), float("nan")
     before = float(np.sqrt(np.mean(made.picks({}) ** 2)))
     known = {name: dict(found[name]) for name in found if name in EFFECTS and EFFECTS[name].stage == "geometry"}
-    if not known:
+    if not known and not learned:
         return before, before
-    steps = made.steps(list(known))
-    s, r = made.signatures(known, steps), made.residual(known)
+    steps, bases = made.steps(list(known)), [made.covariates()[name] for name in learned]
+    r = made.residual(known)
+    s = made.signatures(known, steps) if steps else np.zeros((r.size, 0))
     length = np.linalg.norm(s, axis=0)
     length[length == 0.0] = 1.0
+    columns = np.column_stack([s / length, *(b.columns for b in bases)])
+    ridge = _ridge(columns, len(steps), r)
     group, squares = made.group[made.order], []
     of_pick = np.concatenate([made.group[(made.line == i) & (made.channel == 0)] for i in range(len(made.lines))])
     for one in np.unique(of_pick):
         train = group != one
-        change = np.linalg.lstsq((s / length)[train], r[train], rcond=1e-6)[0] / length
+        beta = _ridged(columns[train], ridge, r[train])
         values: Parameters = known
-        for (effect, key, _), value in zip(steps, change, strict=True):
+        for (effect, key, _), value in zip(steps, beta[: len(steps)] / length, strict=True):
             values = _moved(values, effect, key, float(value))
-        squares.append(made.picks(values)[of_pick == one].ravel() ** 2)
+        left = made.picks(values) - made.displaced(bases, beta[len(steps) :])
+        squares.append(left[of_pick == one].ravel() ** 2)
     return before, float(np.sqrt(np.mean(np.concatenate(squares))))
+
+
+def _ridged(columns: Array, ridge: Array, y: Array) -> Array:
+    """argmin |y − C·β|² + Σ ridge²·β² (q,)."""
+    both = np.vstack([columns, np.diag(ridge)])
+    return np.asarray(np.linalg.lstsq(both, np.append(y, np.zeros(ridge.size)), rcond=1e-6)[0])
+
+
+def _ridge(columns: Array, free: int, y: Array) -> Array:
+    """1/τ (q,) of columns beyond the first `free`, whose coefficients are N(0, τ²), by themselves; zero for the others."""
+    ridge = np.zeros(columns.shape[1])
+    for _ in range(3):
+        beta = _ridged(columns, ridge, y)[free:]
+        ridge[free:] = 1.0 / max(float(np.sqrt(np.mean(beta**2))), 1e-9) if beta.size else 0.0
+    return ridge
