@@ -60,6 +60,7 @@ OPEN_POSITION, OPEN_VELOCITY = 30.0, 1.0  # m, m/s: the start's sigmas
 WIDER = 20.0  # times the declared sigmas of scale factors: the prior of the run that the start is taken from
 WIDE_ARM, WIDE_LATENCY = 1.0, 0.5  # m, s: the same
 SIGMAS = 5.0  # of the declared scale factor's: a size worth naming
+TOLD = 6.0  # sigma of a lag of the velocities
 VELOCITIES = 3  # components of a fix, before those of its velocity
 MINUTE, SHORTEST, GROUPS = 60.0, 15.0, 8  # s, s: what is held out is a minute, or an eighth of a shorter flight
 FEWEST_FIXES = 20
@@ -284,6 +285,21 @@ def residual_problem(
         covariates=_covariates(solution, chosen, count, temperature),
         unit="sigma",
         group_names=names,
+        notes=_lag_note(first) if count > VELOCITIES else (),
+    )
+
+
+def _lag_note(first: Linearisation) -> tuple[str, ...]:
+    """Told where it is beyond doubt, since the model of a receiver has no such lag."""
+    information = float(first.velocity_lag @ first.velocity_lag)
+    if not information > 0.0:
+        return ()
+    lag, sigma = float(first.velocity_lag @ first.residual) / information, 1.0 / np.sqrt(information)
+    if abs(lag) < TOLD * sigma:
+        return ()
+    late = "late" if lag > 0.0 else "early"
+    return (
+        f"the velocities are {1e3 * abs(lag):.3g} ± {1e3 * sigma:.2g} ms {late} against the positions of their fixes",
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -208,6 +209,9 @@ def test_velocities_that_lag_are_no_latency() -> None:
         result = run(p, QUICK, 1)
         assert found(result) == (["gnss_latency"] if clock else [])
         within(result, {"gnss_latency": {"latency": clock}})
+        if not clock:
+            told = re.search(r"velocities are ([\d.]+) ± ([\d.]+) ms late", result.notes[0])
+            assert told and abs(float(told[1]) - 40.0) < 4.0 * float(told[2])
 
 
 # --- measured and shared data ----------------------------------------------------------------------------------------
