@@ -176,7 +176,8 @@ def _with(update: ModelUpdate, part: Part, answer: dict[str, Any], alone: bool) 
         {
             "stage": step["stage"],
             "covariate": step["effect"].removeprefix("learned:"),
-            "unit": answer["heldout_rms"]["unit"],
+            "covariate_unit": step["units"]["covariate"],
+            "unit": ", ".join(dict.fromkeys(u for column, u in step["units"].items() if column != "covariate")),
             "table": step["table"],
         }
         for step in answer["steps"]
