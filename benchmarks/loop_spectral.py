@@ -46,12 +46,12 @@ STRENGTH = {
 }
 FRINGE = {"thickness": 8.3e-6, "phase": 0.7}
 COVARIATES = {  # with which what each effect leaves does vary
-    "opd_scale": ("OPD",),
-    "opd_quadratic": ("OPD",),
-    "fringe_tilt": ("row", "OPD"),
-    "detector_nonlinearity": ("signal level", "OPD"),
-    "channel_fringe": ("OPD",),
-    "response_scale": ("signal level", "OPD"),
+    "opd_scale": ("path by OPD",),
+    "opd_quadratic": ("path by OPD",),
+    "fringe_tilt": ("path by row",),
+    "detector_nonlinearity": ("signal level",),
+    "channel_fringe": ("wavenumber",),
+    "response_scale": ("signal level", "wavenumber"),
 }
 
 

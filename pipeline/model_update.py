@@ -38,13 +38,14 @@ from tsmftis.effects import EFFECTS, Effect
 FORMAT = "tsmftis-model-update/1"
 SECTIONS = ("format", "effects", "bench", "learned")
 LEARNED = ("stage", "covariate", "unit", "table")
+MAY_HAVE = {"covariate_unit"}
 Effects = dict[str, dict[str, Any]]  # floats, and tuples of three where an effect has lists
 
 
 @dataclass(frozen=True)
 class ModelUpdate:
     """`effects` of the campaign's instrument; `bench`: those of single laboratory interferograms; `learned`: curves on record,
-    each with stage, covariate, unit and table {covariate: […], value: […]}."""
+    each with stage, covariate, unit of the curve and table {covariate: […], value: […]}, and the covariate's unit where known."""
 
     effects: Effects = field(default_factory=dict)
     bench: Mapping[str, Effects] = field(default_factory=dict)
@@ -98,7 +99,7 @@ def _learned(path: Path, given: Any) -> tuple[Mapping[str, Any], ...]:
         raise InputError(path, "key 'learned'", "is no list", "write one entry a curve, or leave it out")
     for i, one in enumerate(given):
         place = f"key 'learned[{i}]'"
-        if not isinstance(one, dict) or set(one) != set(LEARNED):
+        if not isinstance(one, dict) or set(one) - MAY_HAVE != set(LEARNED):
             raise InputError(path, place, "is no learned term", f"it has {', '.join(LEARNED)}")
         table = one["table"]
         columns = list(table.values()) if isinstance(table, dict) else []

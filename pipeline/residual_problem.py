@@ -74,13 +74,15 @@ class Basis:
 
     columns (n, k): curves of the covariate as they show in the samples, the straight line first, none constant in the
     covariate; values (n,): the covariate at each sample, NaN where it has none; at (m,) and curves, name → (m, k): what the
-    columns stand for, for a table.
+    columns stand for, for a table; unit of the covariate, units of the curves by their names.
     """
 
     columns: Array
     values: Array
     at: Array
     curves: Mapping[str, Array]
+    unit: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

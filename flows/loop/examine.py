@@ -87,7 +87,10 @@ def content_of(part: Part, problem: ResidualProblem, result: LoopResult) -> dict
     return content | {
         "stage": part.stage,
         "bench": part.bench,
-        "steps": [step | {"parameters": gathered(step["effect"], step["parameters"])} for step in content["steps"]],
+        "steps": [
+            step | {"parameters": gathered(step["effect"], step["parameters"])} | units_of(problem, step)
+            for step in content["steps"]
+        ],
         "considered": plain(result.considered),
         "sealed": plain(result.sealed),
         "heldout_rms": {
@@ -108,7 +111,8 @@ def learned_of(answer: Mapping[str, Any]) -> tuple[dict[str, Any], ...]:
         {
             "stage": step["stage"],
             "covariate": step["effect"].removeprefix("learned:"),
-            "unit": answer["heldout_rms"]["unit"],
+            "covariate_unit": step["units"]["covariate"],
+            "unit": ", ".join(dict.fromkeys(u for column, u in step["units"].items() if column != "covariate")),
             "table": step["table"],
         }
         for step in answer["steps"]
@@ -151,6 +155,16 @@ def _refits(problem: ResidualProblem, result: LoopResult) -> list[dict[str, Any]
     return out
 
 
+def units_of(problem: ResidualProblem, step: Mapping[str, Any]) -> dict[str, Any]:
+    """`units` of a learned term's table, by its columns; nothing for a named effect."""
+    if "table" not in step:
+        return {}
+    covariate = problem.covariates[step["effect"].removeprefix("learned:")]
+    if isinstance(covariate, Basis):
+        return {"units": {"covariate": covariate.unit, **covariate.units}}
+    return {"units": {"covariate": "", "value": problem.unit}}
+
+
 def pictures_of(problem: ResidualProblem, result: LoopResult) -> xr.Dataset:
     """Residual before and after, the terms of the effects, covariates; all over the samples."""
     n = problem.group.size
@@ -166,7 +180,11 @@ def pictures_of(problem: ResidualProblem, result: LoopResult) -> xr.Dataset:
     }
     variables |= {f"term_{name}": ("sample", term, unit) for name, term in result.pictures.terms.items()}
     variables |= {
-        f"covariate_{i}": ("sample", x.values if isinstance(x, Basis) else x, {"long_name": name})
+        f"covariate_{i}": (
+            ("sample", x.values, {"long_name": name, "units": x.unit})
+            if isinstance(x, Basis)
+            else ("sample", x, {"long_name": name})
+        )
         for i, (name, x) in enumerate(problem.covariates.items())
     }
     return xr.Dataset(variables, attrs={"stage": problem.stage})

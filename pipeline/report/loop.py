@@ -50,6 +50,11 @@ def write_loop_page(content: dict[str, Any], out: Path) -> Path:
         with open_dataset(out / "loop" / f"{name}.nc") as d:
             shown[name] = {
                 "terms": {k[5:]: draw.html(evidence(d.load(), k)) for k in map(str, d) if k.startswith("term_")},
+                "curves": {
+                    s["effect"].removeprefix("learned:"): draw.html(curve(s["table"], s["units"], s["effect"]))
+                    for s in content["parts"][name]["steps"]
+                    if "table" in s
+                },
                 "covariates": draw.html(covariates(d.load())),
                 "residual": draw.html(residual(d.load())),
             }
@@ -148,6 +153,28 @@ def evidence(d: xr.Dataset, term: str) -> go.Figure:
     return layout(figure, 400)
 
 
+def curve(table: dict[str, list[float]], units: dict[str, str], effect: str) -> go.Figure:
+    """A learned term over its covariate, both in their own units."""
+    figure = go.Figure()
+    figure.add_hline(y=0.0, line={"color": "#999", "width": 1})
+    shades = (COLOURS["after"], "#e07b00", "#3a9a4d")
+    for i, (name, y) in enumerate((k, v) for k, v in table.items() if k != "covariate"):
+        figure.add_scatter(
+            x=table["covariate"], y=y, mode="lines", name=name.removesuffix("_px"), line={"color": shades[i % 3]}
+        )
+    figure.update_xaxes(title=f"{effect.removeprefix('learned:').rsplit(' by ')[-1]}{_in(units['covariate'])}")
+    figure.update_yaxes(
+        title=", ".join(f"{k.removesuffix('_px')}{_in(u)}" for k, u in units.items() if k != "covariate")
+    )
+    figure.update_yaxes(exponentformat="e")
+    return layout(figure, 340)
+
+
+def _in(unit: str) -> str:
+    """[unit], nothing where it is not known."""
+    return f" [{unit}]" if unit else ""
+
+
 def covariates(d: xr.Dataset) -> go.Figure:
     """Residual before and after, binned, against the nine covariates that it follows most; once where nothing was added."""
     shown, same = [], bool((d["before"] == d["after"]).all())
@@ -166,7 +193,7 @@ def covariates(d: xr.Dataset) -> go.Figure:
     figure = make_subplots(
         rows=rows,
         cols=COLUMNS,
-        subplot_titles=[d[k].attrs["long_name"] for _, k, _, _ in shown],
+        subplot_titles=[d[k].attrs["long_name"] + _in(d[k].attrs.get("units", "")) for _, k, _, _ in shown],
         vertical_spacing=0.3 / rows,
         horizontal_spacing=0.07,
     )

@@ -23,6 +23,7 @@ from pipeline.errors import InputError
 from pipeline.records import Bench
 from pipeline.residual_problem import Candidate, Parameter, Parameters, ResidualProblem
 from stages.bench.bench import BenchSettings, choose, corrected, find_zpd, linear
+from stages.bench.covariates import covariates_of
 from tsmftis import fourier
 from tsmftis.effects import EFFECTS
 
@@ -102,7 +103,7 @@ def residual_problem(bench: Bench, settings: BenchSettings | None = None) -> Res
         series=np.zeros(wavenumber.size, int),
         time=wavenumber,
         nuisance=unit * reference[:, None],
-        covariates={"wavenumber": wavenumber, "signal level": reference},
+        covariates=covariates_of(bench, settings, every[::stride], used, reference, unit),
         floor=ACCURACY,
         unit="of the spectrum",
         group_names={i: f"{edges[i]:.0f}–{edges[i + 1]:.0f} m-1" for i in range(BANDS)},

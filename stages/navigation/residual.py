@@ -60,7 +60,7 @@ OPEN_POSITION, OPEN_VELOCITY = 30.0, 1.0  # m, m/s: the start's sigmas
 WIDER = 20.0  # times the declared sigmas of scale factors: the prior of the run that the start is taken from
 WIDE_ARM, WIDE_LATENCY = 1.0, 0.5  # m, s: the same
 SIGMAS = 5.0  # of the declared scale factor's: a size worth naming
-TOLD = 6.0  # sigma of a lag of the velocities
+TOLD, LAG_ROUNDS = 6.0, 4  # sigma of a lag of the velocities that is beyond doubt; rounds in which it is taken off
 VELOCITIES = 3  # components of a fix, before those of its velocity
 MINUTE, SHORTEST, GROUPS = 60.0, 15.0, 8  # s, s: what is held out is a minute, or an eighth of a shorter flight
 FEWEST_FIXES = 20
@@ -234,12 +234,50 @@ def residual_problem(
 ) -> ResidualProblem:
     """Of one flight; the arguments are those of `run`. Candidates are relative to the declared model with `effects` in it.
 
+    Velocities that lag beyond doubt are moved to their positions' instants first: fixes would be refused for them.
     Raises InputError as `run` does, and where too few fixes are left.
     """
-    effects = effects or {}
-    temperature = _temperature(imu)
-    solution = _widely_estimated(imu, gnss, model, mounting, settings, initial, correction, effects)
-    theta = declared(mounting, effects)
+    effects, lag = effects or {}, 0.0
+    for _ in range(LAG_ROUNDS):
+        solution = _widely_estimated(imu, gnss, model, mounting, settings, initial, correction, effects)
+        innovations = _innovations(solution, model, settings, declared(mounting, effects))
+        first = innovations.at(np.zeros(len(innovations.order)))
+        count = first.residual.size // innovations.chosen.size
+        if count == VELOCITIES or gnss.velocity is None:
+            break
+        signatures = np.column_stack([first.signatures, first.velocity_lag])
+        more, sigma = _beside_all(signatures, first.residual, signatures.shape[1] - 1)
+        if abs(more) < TOLD * sigma:
+            break
+        lag += more
+        moved = gnss.velocity + more * _acceleration(solution, np.arange(gnss.time.size))
+        gnss = replace(gnss, velocity=np.where(np.isfinite(moved), moved, gnss.velocity))
+    chosen = innovations.chosen
+    notes: tuple[str, ...] = ()
+    if lag != 0.0:
+        told = f"the velocities are {1e3 * abs(lag):.3g} ± {1e3 * sigma:.2g} ms {'late' if lag > 0.0 else 'early'}"
+        notes = (f"{told} against the positions of their fixes, and are taken at those instants here",)
+    time = gnss.time[chosen]
+    group, names = _groups(time)
+    component = np.repeat(np.arange(count), chosen.size)
+    return ResidualProblem(
+        stage="navigation",
+        residual=innovations,
+        candidates=_candidates(model, settings),
+        group=np.tile(group, count),
+        series=component,
+        time=np.tile(time, count),
+        nuisance=first.velocity_lag[:, None] if count > VELOCITIES else np.zeros((component.size, 0)),
+        channel=component,
+        covariates=_covariates(solution, chosen, count, _temperature(imu)),
+        unit="sigma",
+        group_names=names,
+        notes=notes,
+    )
+
+
+def _innovations(solution: Solution, model: ImuModel, settings: NavigationSettings, theta: Array) -> Innovations:
+    """Those of the filter with its default states at the declared parameters θ, begun and cleared of outliers by `solution`."""
     estimate = tuple(g for g in settings.estimate if g not in DECIDED_HERE)
     start = settled_start(solution)
     null = replace(
@@ -267,40 +305,7 @@ def residual_problem(
     candidates = _candidates(model, settings)
     order = tuple((c.effect, name) for c in candidates for name in c.parameters)
     steps = np.array([c.parameters[name].difference for c in candidates for name in c.parameters])
-    innovations = Innovations(null, refused, chosen, order, steps)
-    first = innovations.at(np.zeros(len(order)))
-    count = first.residual.size // chosen.size
-    time = gnss.time[chosen]
-    group, names = _groups(time)
-    component = np.repeat(np.arange(count), chosen.size)
-    return ResidualProblem(
-        stage="navigation",
-        residual=innovations,
-        candidates=candidates,
-        group=np.tile(group, count),
-        series=component,
-        time=np.tile(time, count),
-        nuisance=first.velocity_lag[:, None] if count > VELOCITIES else np.zeros((component.size, 0)),
-        channel=component,
-        covariates=_covariates(solution, chosen, count, temperature),
-        unit="sigma",
-        group_names=names,
-        notes=_lag_note(first) if count > VELOCITIES else (),
-    )
-
-
-def _lag_note(first: Linearisation) -> tuple[str, ...]:
-    """Told where it is beyond doubt, since the model of a receiver has no such lag."""
-    information = float(first.velocity_lag @ first.velocity_lag)
-    if not information > 0.0:
-        return ()
-    lag, sigma = float(first.velocity_lag @ first.residual) / information, 1.0 / np.sqrt(information)
-    if abs(lag) < TOLD * sigma:
-        return ()
-    late = "late" if lag > 0.0 else "early"
-    return (
-        f"the velocities are {1e3 * abs(lag):.3g} ± {1e3 * sigma:.2g} ms {late} against the positions of their fixes",
-    )
+    return Innovations(null, refused, chosen, order, steps)
 
 
 def _groups(time: Array) -> tuple[NDArray[np.int64], dict[int, str]]:
@@ -382,6 +387,14 @@ def _temperature(imu: Imu) -> tuple[Array, Array] | None:
     return (t.time, np.nanmean(np.hstack(read), axis=1)) if read else None
 
 
+def _acceleration(solution: Solution, chosen: NDArray[np.int64]) -> Array:
+    """Of the unit at these fixes (k, 3), north, east, down [m/s²]."""
+    store, time = solution.store, solution.problem.gnss.time[chosen]
+    k = np.searchsorted(solution.problem.imu.time, time).clip(0, store.epoch.size - 1)
+    force = solution.gathered.measurements.force[solution.gathered.of_fix[chosen]]
+    return np.einsum("kij,kj->ki", quaternion_to_dcm(store.q[k]), force) + np.array([0.0, 0.0, STANDARD_GRAVITY])
+
+
 def _covariates(
     solution: Solution, chosen: NDArray[np.int64], count: int, temperature: tuple[Array, Array] | None
 ) -> dict[str, Array]:
@@ -394,7 +407,7 @@ def _covariates(
     roll, pitch, yaw = dcm_to_rpy(dcm)
     rate, force = solution.gathered.measurements.rate[fixes], solution.gathered.measurements.force[fixes]
     turning = np.einsum("kij,kj->ki", dcm, rate)
-    acceleration = np.einsum("kij,kj->ki", dcm, force) + np.array([0.0, 0.0, STANDARD_GRAVITY])
+    acceleration = _acceleration(solution, chosen)
     common = {
         "time": time,
         "speed": np.hypot(velocity[:, 0], velocity[:, 1]),

@@ -1,25 +1,17 @@
-"""Curves of covariates, for displacements in the image that no declared effect accounts for.
+"""What displacements in the image may be curves of, where no declared effect accounts for them.
 
-Functions
----------
-curves_of    a straight line and natural cubic splines without it, on quantiles of some values
-COVARIATES   what displacements in row and in column may be curves of
+COVARIATES: name → values (n, 2) for displacements in row and in column; UNITS of the values.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 Array = NDArray[np.float64]
-
-KNOTS = 6
-TABLE = 25
-CONSTANT = 1e-9  # relative spread below which a covariate does not vary
 
 
 @dataclass(frozen=True)
@@ -41,6 +33,17 @@ def _both(value: Array) -> Array:
     return np.stack([value, value], -1)
 
 
+UNITS = {
+    "time": "s",
+    "temperature": "degC",
+    "row": "px",
+    "column": "px",
+    "attitude": "rad",
+    "angular rate": "rad s-1",
+    "angular acceleration": "rad s-2",
+    "ground speed": "m s-1",
+    "image radius": "px",
+}
 # Of displacements in row and in column, each: roll moves rows, pitch columns.
 COVARIATES: Mapping[str, Callable[[Place], Array]] = {
     "time": lambda p: _both(p.time),
@@ -52,50 +55,3 @@ COVARIATES: Mapping[str, Callable[[Place], Array]] = {
     "angular acceleration": lambda p: p.acceleration[:, :2],
     "ground speed": lambda p: _both(p.speed),
 }
-
-
-@dataclass(frozen=True)
-class Curves:
-    """Of x: (x − centre)/spread, and cardinal splines of the inner knots less their own `line` (2, k).
-
-    A curve of a distance has its centre at zero, and the line that is taken off goes through it: a scale is then the line itself.
-    """
-
-    centre: float
-    spread: float
-    knots: Array
-    line: Array
-
-    @property
-    def count(self) -> int:
-        return 1 + self.line.shape[1]
-
-    @property
-    def table(self) -> Array:
-        return np.linspace(self.knots[0], self.knots[-1], TABLE)
-
-    def __call__(self, x: Array) -> Array:
-        """(n, count)."""
-        line = (x - self.centre) / self.spread
-        if self.count == 1:
-            return line[:, None]
-        return np.column_stack([line, self.bends(x) - np.column_stack([np.ones(x.size), line]) @ self.line])
-
-    def bends(self, x: Array) -> Array:
-        """The splines themselves; beyond the outer knots straight on."""
-        spline = CubicSpline(self.knots, np.eye(self.knots.size)[:, 1:-1], bc_type="natural")
-        inside = np.clip(x, self.knots[0], self.knots[-1])
-        return np.asarray(spline(inside) + spline(inside, 1) * (x - inside)[:, None])
-
-
-def curves_of(values: Array, distance: bool = False) -> Curves | None:
-    """None where the values do not vary or are not known; `distance`: they are distances from a point that does not move."""
-    spread = float(np.std(values))
-    if not np.isfinite(spread) or spread <= CONSTANT * max(1.0, float(np.max(np.abs(values)))):
-        return None
-    knots = np.unique(np.quantile(values, np.linspace(0.0, 1.0, KNOTS)))
-    made = Curves(0.0 if distance else float(values.mean()), spread, knots, np.zeros((2, 0)))
-    if knots.size < KNOTS:
-        return made
-    flat = np.column_stack([np.full(values.size, float(not distance)), (values - made.centre) / spread])
-    return replace(made, line=np.asarray(np.linalg.lstsq(flat, made.bends(values), rcond=None)[0], float))

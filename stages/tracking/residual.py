@@ -21,8 +21,9 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.curves import Curves, curves_of
 from pipeline.residual_problem import Basis, Candidate, Parameter, Parameters, ResidualProblem
-from stages.tracking.curves import COVARIATES, Curves, Place, curves_of
+from stages.tracking.curves import COVARIATES, UNITS, Place
 from stages.tracking.line_rows import SERIES, Geometry, GeometrySettings, Line, LineRows, Rows, Terrain, chosen
 from stages.tracking.pos_errors import whitener
 from tsmftis.camera import Camera, Mounting
@@ -178,14 +179,17 @@ class _Campaign:
             curve_of = [curves_of(np.concatenate([of(p)[:, axis] for p in every])) for axis in (0, 1)]
             if any(c is None for c in curve_of):
                 continue
-            out[name] = self._basis(places, of, curve_of, None)
+            out[name] = self._basis(name, places, of, curve_of, None)
         ring = curves_of(np.concatenate([radius(p) for p in every]), distance=True)
         if ring is not None:
-            out["image radius"] = self._basis(places, lambda p: np.stack([radius(p)] * 2, -1), [ring], radial)
+            out["image radius"] = self._basis(
+                "image radius", places, lambda p: np.stack([radius(p)] * 2, -1), [ring], radial
+            )
         return out
 
     def _basis(
         self,
+        name: str,
         places: Sequence[Sequence[Place]],
         of: Callable[[Place], Array],
         curves: Sequence[Curves | None],
@@ -222,8 +226,8 @@ class _Campaign:
             wide = [np.zeros((at.size, 2 * k)) for _ in (0, 1)]
             for axis in (0, 1):
                 wide[axis][:, axis * k : (axis + 1) * k] = known[axis](at)
-            table = {name: w / scale for name, w in zip(("row_px", "column_px"), wide, strict=True)}
-        return Basis(columns / scale, values[self.order], at, table)
+            table = {axis: w / scale for axis, w in zip(("row_px", "column_px"), wide, strict=True)}
+        return Basis(columns / scale, values[self.order], at, table, UNITS[name], dict.fromkeys(table, "px"))
 
     def signatures(self, at: Parameters, of: Sequence[tuple[str, str, float]], whitened: bool = True) -> Array:
         """∂prediction/∂parameter (n, k) by differences of the given steps."""

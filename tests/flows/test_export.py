@@ -182,6 +182,7 @@ def test_an_update_is_read_as_it_was_written(tmp_path: Path) -> None:
             {
                 "stage": "thermal",
                 "covariate": "time",
+                "covariate_unit": "s",
                 "unit": "rad s-1",
                 "table": {"covariate": [0, 9.5], "value": [0.0, 1e-7]},
             },

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_navigation import SPAN, manoeuvres, problem, recorded
-from simulated import LEVER, MEMS, RLG, fixes
+from loop_navigation import manoeuvres, problem, recorded
+from simulated import LEVER, MEMS, RLG, SIGMA_VELOCITY
 
 from pipeline.campaign import read_campaign
 from pipeline.errors import InputError
@@ -23,6 +23,7 @@ from stages.navigation import NavigationSettings, residual_problem
 from stages.navigation import run as navigate
 from tsmftis.camera import Mounting
 from tsmftis.effects import Effects
+from tsmftis.simulator.gnss import observe
 
 SHARED = Path(os.environ.get("TSMFTIS_SHARED", Path(__file__).parents[2].parent / "shared")) / "campaigns"
 QUICK = LoopSettings(draws=1000)
@@ -202,7 +203,8 @@ def test_velocities_that_lag_are_no_latency() -> None:
     """A receiver's filter makes velocities late by 40 ms: nothing is added; the clock's own latency beside it is found."""
     imu, gnss, initial = recorded(MEMS, 0, 5, {})
     craft, _ = manoeuvres(0)
-    velocity = fixes(craft, float(imu.time[-1]) - 0.3, np.random.default_rng(8), latency=0.04, interval=SPAN).velocity
+    noise = np.random.default_rng(8).standard_normal((gnss.time.size, 3))
+    velocity = observe(craft, gnss.time - 0.04, LEVER, 0.0, 0.0 * noise, SIGMA_VELOCITY * noise).velocity
     for clock in (0.0, 0.03):
         given = replace(gnss, velocity=velocity, time=gnss.time + clock)
         p = residual_problem(imu, given, MEMS.model, Mounting(LEVER), NavigationSettings(), initial=initial)

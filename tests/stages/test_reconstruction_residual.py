@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -15,7 +15,7 @@ import pytest
 from pipeline.campaign import read_campaign
 from pipeline.errors import InputError
 from pipeline.records import Tracks
-from pipeline.residual_problem import ResidualProblem
+from pipeline.residual_problem import Basis, ResidualProblem
 from pipeline.truth import read_true_poses
 from stages.closed_loop import LoopSettings, run
 from stages.reconstruction import SpectralLine, residual_problem
@@ -60,7 +60,10 @@ def test_residual_of_clean_data_is_white_and_of_the_noises_size() -> None:
     assert per_degree(problem, {}) == pytest.approx(1.0, abs=0.12)
     assert all(abs(correlation(problem, lag)) < 0.09 for lag in (1, 2, 3, 10))
     r = problem.residual({})
-    for name, x in problem.covariates.items():
+    for name, covariate in problem.covariates.items():
+        x = covariate.values if isinstance(covariate, Basis) else covariate
+        if not np.isfinite(x).all():
+            continue
         eighth = np.argsort(np.argsort(x)) * 8 // x.size
         means = [r[eighth == i].mean() * np.sqrt((eighth == i).sum()) for i in range(8)]
         assert np.abs(means).max() < 3.7, name
@@ -86,6 +89,67 @@ def test_effects_that_are_known_already_belong_to_the_null() -> None:
 def test_loop_adds_nothing_to_clean_data() -> None:
     result = run(clean(), LoopSettings(), 1)
     assert result.verdict == "no_effect"
+
+
+@pytest.mark.parametrize(
+    ("covariate", "curve", "effect", "size", "expected"),
+    [
+        ("path by OPD", "path", "opd_scale", 1e-5, lambda x: 1e-5 * x),
+        ("path by row", "path", "fringe_tilt", 1e-12, lambda x: 1e-12 * (x - 31.5)),
+        ("wavenumber", "response", "response_scale", 1e-3, lambda x: 1e-3 + 0.0 * x),
+        ("signal level", "signal", "response_scale", 1e-3, lambda x: 1e-3 * x),
+        ("signal level", "signal", "detector_nonlinearity", 1e-4, lambda x: -1e-4 * x**2 / 12000.0),
+    ],
+)
+def test_curves_are_those_of_effects_where_an_effect_is_one(
+    covariate: str, curve: str, effect: str, size: float, expected: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    """The residual that an effect leaves is met by the covariate's columns; the curve is the effect's, but for a constant."""
+    problem = clean()
+    basis = problem.covariates[covariate]
+    assert isinstance(basis, Basis)
+    key = made_up.STRENGTH[effect]
+    left = problem.residual({effect: {key: -size}}) - problem.residual({effect: {key: size}})
+    left -= problem.nuisance @ np.linalg.lstsq(problem.nuisance, left, rcond=None)[0]
+    both = np.column_stack([basis.columns, problem.nuisance])
+    both /= np.linalg.norm(both, axis=0)
+    fit = np.linalg.lstsq(both, left, rcond=1e-9)[0]
+    assert np.linalg.norm(left - both @ fit) < 0.05 * np.linalg.norm(left)
+    found = basis.curves[curve] @ (fit[: basis.columns.shape[1]] / np.linalg.norm(basis.columns, axis=0)) / 2.0
+    told = expected(basis.at)
+    difference = found - told
+    if covariate != "wavenumber":
+        difference -= np.polyval(np.polyfit(basis.at, difference, int(effect == "detector_nonlinearity")), basis.at)
+    assert np.abs(difference).max() < 0.1 * np.abs(told).max()
+
+
+@pytest.mark.parametrize(
+    ("effect", "size", "covariate", "start"),
+    [("opd_scale", 1e-3, "path by OPD", 0.0), ("fringe_tilt", 1e-10, "path by row", 31.5)],
+)
+def test_an_effect_outside_the_library_is_learnt_with_its_covariate(
+    effect: str, size: float, covariate: str, start: float
+) -> None:
+    given = {effect: {made_up.STRENGTH[effect]: size}}
+    result = run(made_up.problem(given, 8, effect), LoopSettings(), 1)
+    assert [s.effect for s in result.steps] == [f"learned:{covariate}"]
+    table = result.steps[0].table
+    assert table is not None
+    slope = np.polyfit(np.subtract(table["covariate"], start), table["path"], 1)[0]
+    assert slope == pytest.approx(size, rel=0.15)
+
+
+def test_a_response_that_is_wrong_by_a_slope_is_learnt_over_wavenumber() -> None:
+    made = made_up.made({}, 9)
+    calibration = made["calibration"]
+    share = np.linspace(-0.025, 0.025, calibration.wavenumber.size)  # type: ignore[attr-defined]
+    bent = replace(calibration, response=calibration.response * (1.0 + share))  # type: ignore[attr-defined,type-var]
+    result = run(residual_problem(**{**made, "calibration": bent}), LoopSettings(), 1)  # type: ignore[arg-type]
+    assert [s.effect for s in result.steps] == ["learned:wavenumber"]
+    table = result.steps[0].table
+    assert table is not None
+    slope = np.polyfit(table["covariate"], table["response"], 1)[0]
+    assert slope * np.ptp(calibration.wavenumber) == pytest.approx(-0.05, rel=0.3)  # type: ignore[attr-defined]
 
 
 def test_loop_names_a_non_linearity_and_nothing_else() -> None:

@@ -14,6 +14,7 @@ from simulated_lines import Flown, flown, settings_of
 
 from flows.settings import Settings
 from flows.steps import Plan, navigation_step
+from pipeline.curves import curves_of
 from pipeline.errors import InputError
 from pipeline.raster import Dem
 from pipeline.records import Trajectory
@@ -21,7 +22,6 @@ from pipeline.residual_problem import Basis, ResidualProblem
 from stages import registration, tracking
 from stages.closed_loop import LoopSettings, run
 from stages.simulation import SimulationSettings
-from stages.tracking.curves import curves_of
 from stages.tracking.pos_errors import whitener
 from tsmftis.inertial import SensorModel
 
