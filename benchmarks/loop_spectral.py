@@ -1,6 +1,6 @@
 """Certification of the spectral residual: what the loop invents, finds, confuses and says when the name is not in its library.
 
-    python benchmarks/loop_spectral.py [--trials 20] [--clean 60] [--seed 1] [--part clean found missing] [--only EFFECT]
+    python benchmarks/loop_spectral.py [--trials 20] [--clean 60] [--seed 1] [--part clean found missing together] [--only EFFECT]
 
 Frames of two lines are made with the simulator's light and detector: seven panels of 9 × 9 pixels each wander over a detector of
 64 × 128 pixels, with tracks that err by 0.3 pixel. A size is in sigma: the Cramér–Rao bound with levels, phase and all other
@@ -53,6 +53,14 @@ COVARIATES = {  # with which what each effect leaves does vary
     "channel_fringe": ("wavenumber",),
     "response_scale": ("signal level", "wavenumber"),
 }
+
+
+TOGETHER: tuple[Given, ...] = (
+    {"opd_scale": {"scale": 4e-3}, "detector_nonlinearity": {"a": 0.08}},
+    {"detector_nonlinearity": {"a": 0.08}, "response_scale": {"scale": -0.03}},
+    {"opd_scale": {"scale": 8e-4}, "opd_quadratic": {"quadratic": 5e-12}, "fringe_tilt": {"tilt": 2e-10}},
+    {"opd_scale": {"scale": 4e-3}, "opd_quadratic": {"quadratic": 5e-11}, "fringe_tilt": {"tilt": 1.5e-9}},
+)
 
 
 def light() -> SimulationSettings:
@@ -225,13 +233,19 @@ def _missing(name: str, trials: int, seed: int) -> None:
     print(f"{name:<22} {size:g} sigma: a wrong name {forced}/{trials}, right covariate {learned}; {listed}", flush=True)
 
 
+def _together(seed: int) -> None:
+    for given in TOGETHER:
+        result = run(problem(given, seed + 76), LoopSettings(), 1)
+        print(f"{' + '.join(given)}: {' + '.join(s.effect for s in result.steps) or result.verdict}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=20, help="data sets of an effect and size")
     parser.add_argument("--clean", type=int, default=60, help="data sets without an effect")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
-        "--part", nargs="*", default=["clean", "found", "missing"], choices=["clean", "found", "missing"]
+        "--part", nargs="*", default=["clean", "found", "missing"], choices=["clean", "found", "missing", "together"]
     )
     parser.add_argument("--only", nargs="*", default=list(STRENGTH), choices=list(STRENGTH), metavar="EFFECT")
     a = parser.parse_args()
@@ -239,6 +253,8 @@ def main() -> None:
     print("bounds: " + ", ".join(f"{n} {s:.2g}" for n, s in sigma.items()))
     if "clean" in a.part:
         _clean(a.clean, a.seed)
+    if "together" in a.part:
+        _together(a.seed)
     for part, measure in (("found", _found), ("missing", _missing)):
         if part in a.part:
             print(part if part == "found" else "not in the library")
