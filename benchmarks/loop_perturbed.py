@@ -72,8 +72,8 @@ CASES: dict[str, tuple[list[Change], Truth]] = {
     "accel-scale": ([partial(IMU, partial(scaled, "accel", (0, 0, 1e-3)))], {"accel_scale_factor": {"z": 1e-3}}),
     "gyro-g": ([partial(IMU, partial(g_sensitive, (0, 0, 5e-7)))], {"gyro_g_sensitivity": {"z": 5e-7}}),
     "gyro-g-chamber": (
-        [partial(edit, glob, partial(g_sensitive, (0, 0, 5e-7))) for glob in ("*/imu.nc", "chamber/*.nc")],
-        {"gyro_g_sensitivity": {"z": 5e-7}},
+        [partial(edit, glob, partial(g_sensitive, (0, 0, 5e-6))) for glob in ("*/imu.nc", "chamber/*.nc")],
+        {"gyro_g_sensitivity": {"z": 5e-6}},
     ),
     "hysteresis": (
         [partial(edit, glob, hysteretic) for glob in ("*/imu.nc", "chamber/*.nc")],
