@@ -229,8 +229,8 @@ def _settled(
 ) -> Estimate:
     """The estimate with those parameters of an added effect that the data tell.
 
-    A shared one is set free where its sensors differ beyond chance; then, the weakest first, what is not told from zero is left
-    out where the candidate tests the effect without it. One stays.
+    A shared one is set free where its sensors differ beyond chance; then, the weakest first, what is not told from zero, or helps
+    no group that is held out, is left out where the candidate tests the effect without it. One stays.
     """
     candidate = candidates[effect]
     for name in [n for n in candidate.shared if n in found.values[effect]]:
@@ -245,11 +245,44 @@ def _settled(
         if len(told) < 2:
             return found
         size = {n: abs(found.values[effect][n]) / max(float(found.sigma[i]), 1e-300) for n, i in told.items()}
-        weakest = min(size, key=lambda n: size[n])
-        if size[weakest] >= TOLD:
+        out = next(
+            (
+                n
+                for n in sorted(size, key=lambda n: size[n])
+                if size[n] < TOLD or not _helps(problem, layout, nuisance, found, effect, told[n])
+            ),
+            None,
+        )
+        if out is None:
             return found
-        own = {k: v for k, v in found.values[effect].items() if k != weakest}
+        own = {k: v for k, v in found.values[effect].items() if k != out}
         found = estimate(problem, layout, nuisance, {**found.values, effect: own}, candidates, found.noise)
+
+
+def _helps(
+    problem: ResidualProblem, layout: Layout, nuisance: Array, found: Estimate, effect: str, column: int
+) -> bool:
+    """Whether groups held out are predicted better with a parameter, estimated from the others, than with its null: in RMS or in
+    likelihood."""
+    rows = layout.rows
+    without = {k: v for k, v in found.values[effect].items() if k != found.order[column][1]}
+    null = np.asarray(problem.residual({**found.values, effect: without}), float)
+    rest = np.delete(found.signatures, column, axis=1)
+    models = (
+        Model(null, np.column_stack([nuisance, rest])),
+        Model(found.residual, np.column_stack([nuisance, found.signatures])),
+    )
+    acting = found.signatures[:, column] != 0.0
+    if problem.channel is not None:
+        acting = np.isin(problem.channel, problem.channel[acting])
+    squares, likelihood = np.zeros(2), np.zeros(2)
+    for held in (rows[f] for f in confirmation.folds_of(problem.group[rows])):
+        train = np.setdiff1d(rows, held)
+        for i, model in enumerate(models):
+            error, value, _ = confirmation.held_out(problem, train, held, model, found.noise, refit=False)
+            squares[i] += float(np.sum(error[acting[held]] ** 2))
+            likelihood[i] += value
+    return bool(squares[1] < squares[0] or likelihood[1] > likelihood[0])
 
 
 def _differ(
