@@ -8,6 +8,11 @@ network could learn of x (`smooth.py`); f, the function that a lag acts on, is f
 belong to N: without them a lag "explains" clean instruments. f is that of x, unless x of some lag explains the data better
 beyond doubt: a function fitted to lagged features has learnt some of the very noise that it is then tested on.
 
+Of a single thermometer with three branches or more, N is a curve in T, with the rate where it predicts branches held out
+better by a tenth, unless one history for the whole unit does better still: rate and history are one another's image there.
+
+A is looked for as one number that the gyros share, one that the accelerometers share, one of each channel alone, and several.
+
 Functions
 ---------
 residual_problem    of chamber runs

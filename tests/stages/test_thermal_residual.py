@@ -83,14 +83,14 @@ def test_a_rate_that_belongs_to_a_single_thermometer_is_no_memory(rate: float) -
 
 @pytest.mark.skipif(not LOG.is_file(), reason=f"the measured log {LOG.name} is not there")
 def test_memory_halves_what_is_held_out_of_a_real_log() -> None:
-    """A consumer unit, one thermometer, three branches: gyro x and accelerometer z have a history, gyro z next to none."""
+    """A consumer unit, one thermometer, three branches: gyro x and accelerometer z have a history, gyro z none."""
     problem = residual_problem([loop_chamber.chamber(LOG)], [], ThermalSettings())
     result = run(problem, LoopSettings(), 1)
     assert result.steps[0].effect == "thermal_hysteresis"
     before, after = loop_chamber.by_channel(problem, {}), loop_chamber.by_channel(problem, result.values)
     ratio = dict(zip(CHANNELS, np.divide(after, before).tolist(), strict=True))
-    assert ratio["gyro_x"] < 0.55 and ratio["accel_z"] < 0.55
-    assert 0.9 < ratio["gyro_z"] < 1.05
+    assert ratio["gyro_x"] < 0.65 and ratio["accel_z"] < 0.5
+    assert max(ratio.values()) < 1.01 and ratio["gyro_z"] > 0.95
 
 
 def test_gyros_of_one_make_are_one_number() -> None:
