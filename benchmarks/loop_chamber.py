@@ -15,9 +15,8 @@ from chamber_log import read
 
 from pipeline.records import Chamber, Temperatures
 from pipeline.residual_problem import Parameters, ResidualProblem
-from stages.closed_loop import LoopSettings, run
+from stages.closed_loop import LoopSettings, refit, run
 from stages.thermal import ThermalSettings, residual_problem
-from stages.thermal.branches import held_out
 from stages.thermal.targets import CHANNELS
 
 
@@ -32,13 +31,18 @@ def chamber(path: Path) -> Chamber:
 
 
 def by_channel(problem: ResidualProblem, parameters: Parameters) -> list[float]:
-    """RMS of each channel in the branches held out, in noises of a block, by least squares."""
-    r, out = problem.residual(parameters), []
-    for one in np.unique(problem.channel):
-        mine = problem.channel == one
-        columns = problem.nuisance[mine]
-        out.append(held_out(columns[:, columns.any(axis=0)], r[mine], problem.group[mine]))
-    return out
+    """RMS of each channel in the branches held out, in noises of a block; curves and effects are those of the other branches."""
+    effects = {effect: dict(values) for effect, values in parameters.items()}
+    labels, squares = np.unique(problem.channel), np.zeros(6)
+    for branch in np.unique(problem.group):
+        r = problem.residual(refit(problem, effects, [int(branch)]) if effects else {})
+        for i, one in enumerate(labels):
+            mine = problem.channel == one
+            columns, held = problem.nuisance[mine], problem.group[mine] == branch
+            columns = columns[:, columns.any(axis=0)]
+            beta = np.linalg.lstsq(columns[~held], r[mine][~held], rcond=None)[0]
+            squares[i] += float(np.sum((r[mine][held] - columns[held] @ beta) ** 2))
+    return np.sqrt(squares[: labels.size] * labels.size / problem.group.size).tolist()
 
 
 def main() -> None:

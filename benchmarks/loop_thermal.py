@@ -81,7 +81,7 @@ def coloured(run: Chamber, noise: str, rng: np.random.Generator) -> Chamber:
 def sigma_of(problem: ResidualProblem, effect: str) -> float:
     """Cramér–Rao sigma of the gyros' common amplitude [rad/s] with its half width, or of the lag [s]."""
     candidate = next(c for c in problem.candidates if c.effect == effect)
-    names = tuple(candidate.parameters)
+    names = tuple(n for n in candidate.parameters if n not in candidate.shared)
     if effect == "thermal_lag":
         s = derivatives(problem, {effect: {"lag": 0.0}}, candidate, names)
     else:

@@ -61,11 +61,15 @@ class Candidate:
     residual there is that of the null (the width of a play whose amplitude is zero), the other parameters are differentiated
     there; where it is not (a lag), the secant from the null to there is the signature. A parameter that an entry puts to
     zero, its null, is left out of the effect where that entry is the one that fits: one axis alone, say.
+
+    shared: parameter → the parameters for which it is one number (adding to each of them): three sensors of one make, say.
+    Answers name those; the shared one is how the effect is looked for, and estimated as long as the data do not tell them apart.
     """
 
     effect: str
     parameters: Mapping[str, Parameter]
     grid: tuple[Mapping[str, float], ...] = ()
+    shared: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

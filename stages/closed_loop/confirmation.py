@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.residual_problem import ResidualProblem
+from stages.closed_loop.identifiability import rivals
 from stages.closed_loop.learned import ridge
 from stages.closed_loop.noise import Layout, Noise, fit_noise, gram, log_det
-from stages.closed_loop.score_test import inverse, log_tail, project, solve, spans, statistic
+from stages.closed_loop.score_test import inverse, log_counts, log_tail, project, solve, spans, statistic
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -124,17 +125,22 @@ def confirm(
     before: Model,
     library: Sequence[Model],
     families: Sequence[str],
+    kinds: Sequence[str],
     chosen: int,
     refined: Model,
     noise: Noise,
+    snr: float,
     refine: Callable[[Index, int], Model] | None = None,
 ) -> Confirmation:
-    """`library`: what each member would make of the model (its columns are before's and its own); `families`: their effects;
-    `refined`: the chosen one's, linearised where it converged; `refine`: the same from training samples and the member that they
-    choose, where the residual is not linear in it."""
+    """`library`: what each member would make of the model (its columns are before's and its own); `families`, `kinds`: whose
+    effect's test each is, and of which kind; `refined`: the chosen one's, linearised where it converged; `refine`: the same from
+    training samples and the member that they choose, where the residual is not linear in it. A training part whose first choice
+    cannot be told from the chosen effect on its own data (below `snr`, see identifiability) has chosen no other: branches that
+    only cool tell no play from a lag.
+    """
     spread = channel_spread(problem, rows, refined, noise)
     touched = _touched(problem, refined.columns[:, refined.added])
-    totals, log_tests = np.zeros(2), np.log([list(families).count(one) for one in families])
+    totals, log_tests = np.zeros(2), log_counts(families, kinds)
     agree, same, gains = 0, True, []
     folds = [rows[f] for f in folds_of(problem.group[rows])]
     p = before.columns.shape[1]
@@ -154,6 +160,7 @@ def confirm(
             value, rank = statistic(project(projected, where[best]), where[chosen])
             tail = log_tail(value, rank) if rank else np.inf
             wanted = tail + log_tests[chosen] < np.log(NEEDED / len(set(families)))
+            wanted = wanted or families[chosen] in rivals(projected, where, families, best, snr)
         model = (
             library[best]
             if not wanted

@@ -22,10 +22,10 @@ from stages.closed_loop.confirmation import Confirmation, Model
 from stages.closed_loop.estimation import Estimate, descend, estimate
 from stages.closed_loop.noise import Layout, Noise, fit_noise, gram
 from stages.closed_loop.result import Considered, LoopResult, Pictures, Sealed, Step, Value, Verdict
-from stages.closed_loop.score_test import Finding, project, search, solve, spans, statistic
+from stages.closed_loop.score_test import Finding, log_counts, project, search, solve, spans, statistic
 from stages.closed_loop.separation import would_separate
 from stages.closed_loop.settings import LoopSettings
-from stages.closed_loop.signatures import Member, Values, members, merged
+from stages.closed_loop.signatures import Member, Values, derivatives, members, merged, tied, untied
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -34,7 +34,8 @@ SEALED_FROM = 4  # groups
 LEARNED_TRIES = 6  # covariates looked at, the most significant first
 NESTED_FROM = 6  # groups; of fewer a training part may lack the very range that places a width or a lag
 CERTAIN = 1e-3  # family-wise p of structure that is there, though nothing accounts for it
-UNNEEDED = 0.05  # p of an effect beside others
+UNNEEDED = 0.05  # p of an effect beside others, or of sensors that differ in what they were taken to share
+TOLD = 2.0  # sigma, from zero
 COVARIATE_WINS = 0.01
 CHANGES = 0.1  # of an effect's χ²
 IS_CURVE = (
@@ -46,10 +47,12 @@ LAGS = 8  # samples apart, over which it is looked at for structure
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why something that stands out is not added, and whether it shows structure all the same."""
+    """Why something that stands out is not added, and whether it shows structure all the same; `channel`: the one that refuses,
+    where it is one alone."""
 
     why: str
     structure: bool
+    channel: int | None = None
 
 
 @dataclass
@@ -62,6 +65,7 @@ class State:
     steps: list[Step] = field(default_factory=list)
     blocked: set[tuple[str, tuple[str, ...]]] = field(default_factory=set)
     dropped: set[str] = field(default_factory=set)
+    narrowed: dict[str, list[dict[str, float]]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     certain: list[str] = field(default_factory=list)
     refused: dict[str, str] = field(default_factory=dict)
@@ -119,7 +123,8 @@ def refit(problem: ResidualProblem, values: Values, without: Sequence[int] = ())
     layout, nuisance = Layout.of(problem, rows), np.asarray(problem.nuisance, float)
     candidates = {c.effect: c for c in problem.candidates}
     noise = fit_noise(layout, nuisance[rows], np.asarray(problem.residual(values), float)[rows])
-    return estimate(problem, layout, nuisance, values, candidates, noise).values
+    found = estimate(problem, layout, nuisance, tied(values, candidates), candidates, noise)
+    return untied(found.values, candidates)
 
 
 def _seal(problem: ResidualProblem, settings: LoopSettings, rng: np.random.Generator) -> tuple[Index, int | None]:
@@ -174,7 +179,9 @@ def _first_look(
 
 def _members(problem: ResidualProblem, state: State, candidates: Mapping[str, Candidate]) -> list[Member]:
     out = {*state.values, *state.dropped}
-    free = [c for name, c in candidates.items() if name not in out]
+    free = [
+        replace(c, grid=(*c.grid, *state.narrowed.get(name, ()))) for name, c in candidates.items() if name not in out
+    ]
     found = [m for c in free for m in members(problem, state.values, state.residual, c)]
     return [m for m in found if (m.effect, m.names) not in state.blocked]
 
@@ -193,8 +200,9 @@ def _named_step(
         found = _members(problem, state, candidates)
         columns, data = state.columns, state.residual
         signatures = [m.columns[rows] for m in found]
+        tests = log_counts([m.effect for m in found], [m.kind for m in found])
         finding, state.noise = search(
-            layout, columns[rows], signatures, data[rows], state.noise, settings.draws, rng, [m.effect for m in found]
+            layout, columns[rows], signatures, data[rows], state.noise, settings.draws, rng, tests
         )
         if finding is None or finding.p > settings.p_value:
             return False
@@ -207,13 +215,123 @@ def _named_step(
             if step.structure and finding.p < CERTAIN:
                 state.certain.append(member.effect)
             state.blocked.add((member.effect, member.names))
+            if step.channel is not None:
+                _narrow(problem, state, found, member, step.channel)
             continue
         added, record = step
+        added = _settled(problem, layout, state.nuisance, added, candidates, member.effect)
         state.estimate, state.residual, state.noise = added, added.residual, added.noise
         state.steps.append(record)
         state.blocked.clear()
         _drop_unneeded(problem, layout, state, candidates, member.effect)
         return True
+
+
+def _settled(
+    problem: ResidualProblem,
+    layout: Layout,
+    nuisance: Array,
+    found: Estimate,
+    candidates: Mapping[str, Candidate],
+    effect: str,
+) -> Estimate:
+    """The estimate with those parameters of an added effect that the data tell.
+
+    A shared one is set free where its sensors differ beyond chance; then, the weakest first, what is not told from zero, or helps
+    no group that is held out, is left out where the candidate tests the effect without it. One stays.
+    """
+    candidate = candidates[effect]
+    for name in [n for n in candidate.shared if n in found.values[effect]]:
+        if _differ(problem, layout, nuisance, found, candidate, name):
+            own = {k: v for k, v in found.values[effect].items() if k != name}
+            own |= dict.fromkeys(candidate.shared[name], found.values[effect][name])
+            values = {**found.values, effect: own}
+            found = estimate(problem, layout, nuisance, values, candidates, found.noise)
+    separate = {name for point in candidate.grid for name, value in point.items() if value == 0.0}
+    while True:
+        told = {found.order[i][1]: i for i in found.columns(effect) if found.order[i][1] in separate}
+        if len(told) < 2:
+            return found
+        size = {n: abs(found.values[effect][n]) / max(float(found.sigma[i]), 1e-300) for n, i in told.items()}
+        out = next(
+            (
+                n
+                for n in sorted(size, key=lambda n: size[n])
+                if size[n] < TOLD or not _helps(problem, layout, nuisance, found, effect, told[n])
+            ),
+            None,
+        )
+        if out is None:
+            return found
+        own = {k: v for k, v in found.values[effect].items() if k != out}
+        found = estimate(problem, layout, nuisance, {**found.values, effect: own}, candidates, found.noise)
+
+
+def _helps(
+    problem: ResidualProblem, layout: Layout, nuisance: Array, found: Estimate, effect: str, column: int
+) -> bool:
+    """Whether groups held out are predicted better with a parameter, estimated from the others, than with its null: in RMS or in
+    likelihood."""
+    rows = layout.rows
+    without = {k: v for k, v in found.values[effect].items() if k != found.order[column][1]}
+    null = np.asarray(problem.residual({**found.values, effect: without}), float)
+    rest = np.delete(found.signatures, column, axis=1)
+    models = (
+        Model(null, np.column_stack([nuisance, rest])),
+        Model(found.residual, np.column_stack([nuisance, found.signatures])),
+    )
+    acting = found.signatures[:, column] != 0.0
+    if problem.channel is not None:
+        acting = np.isin(problem.channel, problem.channel[acting])
+    squares, likelihood = np.zeros(2), np.zeros(2)
+    for held in (rows[f] for f in confirmation.folds_of(problem.group[rows])):
+        train = np.setdiff1d(rows, held)
+        for i, model in enumerate(models):
+            error, value, _ = confirmation.held_out(problem, train, held, model, found.noise, refit=False)
+            squares[i] += float(np.sum(error[acting[held]] ** 2))
+            likelihood[i] += value
+    return bool(squares[1] < squares[0] or likelihood[1] > likelihood[0])
+
+
+def _differ(
+    problem: ResidualProblem, layout: Layout, nuisance: Array, found: Estimate, candidate: Candidate, name: str
+) -> bool:
+    """Whether the parameters that share one number ask for several."""
+    free = derivatives(problem, found.values, candidate, candidate.shared[name])
+    columns = np.column_stack([nuisance, found.signatures])
+    p, rows = columns.shape[1], layout.rows
+    m = gram(layout, found.noise, np.column_stack([columns, free, found.residual])[rows])
+    # One direction of theirs is the shared one's, which is projected off: rounding must not stand for it.
+    m = m[:, [i for i in range(m.shape[1]) if i != p]][[i for i in range(m.shape[0]) if i != p]]
+    value, rank = statistic(project(m, slice(0, p)), range(p, p + free.shape[1] - 1))
+    return bool(rank) and float(chdtrc(rank, value)) < UNNEEDED
+
+
+def _narrow(problem: ResidualProblem, state: State, found: Sequence[Member], member: Member, channel: int) -> None:
+    """A channel in which an effect's size is not one number has something else: the next test is the effect without it. Only what
+    the candidate itself puts to zero in some of its tests, and in no channel but this one, can be left out."""
+    assert problem.channel is not None
+    elsewhere = problem.channel != channel
+    separate = {name for m in found if m.effect == member.effect for name, value in m.point.items() if value == 0.0}
+    columns = member.columns[:, member.secant :]
+    acts = {
+        n: bool(c[~elsewhere].any()) and not c[elsewhere].any() for n, c in zip(member.names, columns.T, strict=True)
+    }
+    out = [name for name, only in acts.items() if only and name in separate]
+    if out and len(out) < len(member.names):
+        grid = state.narrowed.setdefault(member.effect, [])
+        alike = [m.point for m in found if m.effect == member.effect and m.names == member.names]
+        grid += [{**point, **dict.fromkeys(out, 0.0)} for point in alike]
+
+
+def _channel(problem: ResidualProblem, covariate: str) -> int | None:
+    """The channel that a covariate alone is of."""
+    if problem.channel is None or covariate not in problem.covariates:
+        return None
+    values = problem.covariates[covariate]
+    known = np.isfinite(values.values if isinstance(values, Basis) else values)
+    labels = np.unique(problem.channel[known])
+    return int(labels[0]) if labels.size == 1 and np.unique(problem.channel).size > 1 else None
 
 
 def _examine(
@@ -235,7 +353,7 @@ def _examine(
     projected = project(gram(layout, finding.noise, whole), slice(0, p))
     where = spans([m.columns.shape[1] for m in found], p)
     amplitude, _ = solve(projected, where[finding.index])
-    rivals = identifiability.rivals(projected, where, found, finding.index, settings.snr)
+    rivals = identifiability.rivals(projected, where, [m.effect for m in found], finding.index, settings.snr)
 
     values = merged(state.values, member.effect, member.start(amplitude))
     estimated = estimate(problem, layout, state.nuisance, values, candidates, finding.noise)
@@ -252,7 +370,7 @@ def _examine(
         return Refusal(f"a spline of {winner} explains the same and more, and leaves nothing for it", True)
 
     if worst := _varies_with(problem, layout, helped, p, data, term, estimated.noise):
-        return Refusal(f"its size changes with {worst}: it stands for something else", True)
+        return Refusal(f"its size changes with {worst}: it stands for something else", True, _channel(problem, worst))
     before = Model(data, columns)
     library = [Model(data, np.column_stack([columns, m.columns])) for m in found]
     own = tuple(state.nuisance.shape[1] + c for c in estimated.columns(member.effect))
@@ -262,7 +380,17 @@ def _examine(
     if candidates[member.effect].grid and np.unique(problem.group[rows]).size >= NESTED_FROM:
         refine = _refiner(problem, state, candidates, found, before, finding.noise)
     checked = confirmation.confirm(
-        problem, rows, before, library, families, finding.index, refined, finding.noise, refine
+        problem,
+        rows,
+        before,
+        library,
+        families,
+        [m.kind for m in found],
+        finding.index,
+        refined,
+        finding.noise,
+        settings.snr,
+        refine,
     )
     if not checked.passes(settings.gain, settings.decisive):
         return Refusal(_why_not(checked), _repeats(checked))
@@ -488,7 +616,7 @@ def _try_learned(
         Model(data, np.column_stack([columns, s]), smooth=tuple(range(p, p + s.shape[1]))) for s in splines.values()
     ]
     checked = confirmation.confirm(
-        problem, rows, Model(data, columns), library, names, finding.index, model, finding.noise
+        problem, rows, Model(data, columns), library, names, names, finding.index, model, finding.noise, settings.snr
     )
     if not confirmation.controls_fail(reached, valid):
         problem_text = f"{reached} of {valid} shifted copies of it do as well"
@@ -550,7 +678,7 @@ def _close(
         rms_after = _cross_validated(problem, rows, after, noise)
     once: Sealed | None = None
     steps = [_with_values(problem, s, state.estimate, candidates) for s in state.steps]
-    values: Mapping[str, Mapping[str, float]] = state.values
+    values: Mapping[str, Mapping[str, float]] = untied(state.values, candidates)
     if sealed is not None and np.isfinite(null).all():
         held = np.flatnonzero(problem.group == sealed)
         e0, l0, _ = confirmation.held_out(problem, rows, held, before, noise, refit=bool(state.steps))
@@ -675,12 +803,19 @@ def _with_values(
     if estimated is None or step.effect not in estimated.values:
         return step
     units = candidates[step.effect].parameters
+    every = [
+        (other, name, j)
+        for j, (other, what) in enumerate(estimated.order)
+        for name in candidates[other].shared.get(what, (what,))
+    ]
     parameters, correlations = {}, {}
-    for i in estimated.columns(step.effect):
-        name = estimated.order[i][1]
-        parameters[name] = Value(estimated.values[step.effect][name], float(estimated.sigma[i]), units[name].unit)
-        for j, (other, what) in enumerate(estimated.order):
-            if j != i:
+    for effect, name, i in every:
+        if effect != step.effect:
+            continue
+        value = estimated.values[effect][estimated.order[i][1]]
+        parameters[name] = Value(value, float(estimated.sigma[i]), units[name].unit)
+        for other, what, j in every:
+            if (other, what) != (effect, name):
                 correlations[f"{name}, {other}.{what}"] = float(estimated.correlation[i, j])
     return replace(step, parameters=parameters, correlations=correlations)
 

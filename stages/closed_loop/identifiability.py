@@ -89,18 +89,19 @@ def _snr(projected: Array, where: Sequence[Sequence[int]], found: Sequence[Membe
 
 
 def rivals(
-    projected: Array, where: Sequence[Sequence[int]], found: Sequence[Member], index: int, snr: float
+    projected: Array, where: Sequence[Sequence[int]], effects: Sequence[str], index: int, snr: float
 ) -> dict[str, float]:
     """Other effect → SNR of member `index`, at the size the data show, once that effect is projected off; only those from
-    which it cannot be told: it falls below `snr` and by a fifth, and the two are alike or explain the data alike."""
+    which it cannot be told: it falls below `snr` and by a fifth, and the two are alike or explain the data alike. `effects`:
+    whose each member is."""
     own = list(where[index])
     u, block = projected[own, -1], projected[np.ix_(own, own)]
     inv, _ = inverse(block)
     theta = inv @ u
     full = float(u @ theta)  # χ²
     out: dict[str, float] = {}
-    for member, columns in zip(found, where, strict=True):
-        if member.effect == found[index].effect:
+    for effect, columns in zip(effects, where, strict=True):
+        if effect == effects[index]:
             continue
         other = [c for c in columns if projected[c, c] > 0.0]
         if not other:
@@ -112,5 +113,5 @@ def rivals(
         v = projected[other, -1]
         close = full - float(v @ inv_other @ v) < PREFERRED
         if left < snr and left < FALL * np.sqrt(full) and (alike or close):
-            out[member.effect] = min(left, out.get(member.effect, np.inf))
+            out[effect] = min(left, out.get(effect, np.inf))
     return out

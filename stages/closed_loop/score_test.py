@@ -7,8 +7,9 @@ Of the Gram matrix M = C'K⁻¹C of C = [N | S₁ | S₂ | … | r], with N proj
 K is fitted by REML with the member in the model: an effect that is there must not count as noise. The p-value of a member is
 the mean of P(χ²_q > χ²_k(K_m)) over noise K_m drawn from its restricted likelihood, which is the F-test where the noise is
 white. An effect that makes n tests (a grid) pays for them itself: its p-values count n times, so that effects of one test do not
-lose power to it. Family-wise: the share of draws u ~ N(0, S'K⁻¹S) in which the smallest n·p of the library is below it, or the
-number of effects times it (Bonferroni's bound), whichever is smaller.
+lose power to it; so do its kinds of hypothesis (one number for several sensors, one sensor, several): n tests of one of m kinds
+count m·n times. Family-wise: the share of draws u ~ N(0, S'K⁻¹S) in which the smallest p of the library, so counted, is below
+it, or the number of effects times it (Bonferroni's bound), whichever is smaller.
 
 Functions
 ---------
@@ -16,6 +17,7 @@ search        the best member with its family-wise p-value
 project       a Gram matrix with columns projected off
 statistic     χ² and rank of some columns
 solve         their coefficients and covariance
+log_counts    how many tests each member stands for
 """
 
 from __future__ import annotations
@@ -104,13 +106,11 @@ def search(
     start: Noise | None,
     draws: int,
     rng: np.random.Generator,
-    effects: Sequence[str] | None = None,
+    log_tests: Array | None = None,
 ) -> tuple[Finding | None, Noise]:
     """The most significant of `signatures` [(rows, q), …] in `residual` (rows,) beside `nuisance` (rows, p), and the noise
-    without any of them; no finding where no signature is left beside the nuisance. `effects`: whose signature each is (default:
-    all of different ones)."""
-    named = list(effects) if effects is not None else [str(i) for i in range(len(signatures))]
-    log_tests = np.log([named.count(one) for one in named])
+    without any of them; no finding where no signature is left beside the nuisance. `log_tests`: of `log_counts` (default: 0)."""
+    log_tests = np.zeros(len(signatures)) if log_tests is None else log_tests
     everything = np.column_stack([nuisance, *signatures, residual])
     p = nuisance.shape[1]
     where = spans([s.shape[1] for s in signatures], p)
@@ -152,6 +152,12 @@ def search(
     projected = project(gram(layout, best.noise, everything), slice(0, p))
     family = family_wise(projected[p:-1, p:-1], spans(sizes, 0), best.log_p, draws, rng, log_tests)
     return Finding(best.index, family, best.log_p, best.chi2, best.rank, best.noise), null
+
+
+def log_counts(effects: Sequence[str], kinds: Sequence[str]) -> Array:
+    """Logarithm of how many times a member's p counts (members,), by its effect and its kind of hypothesis."""
+    both = list(zip(effects, kinds, strict=True))
+    return np.log([both.count(one) * len({k for e, k in both if e == one[0]}) for one in both])
 
 
 def _log_p(projected: Array, where: Sequence[Sequence[int]]) -> Array:

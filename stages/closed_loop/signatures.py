@@ -4,11 +4,13 @@ Functions
 ---------
 members        the tests that a candidate makes at the present parameters
 derivatives    S of given parameters about a point
+untied         values with shared parameters as those that they stand for
+tied           the reverse
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,13 +27,14 @@ SAME = 1e-9  # relative change of the residual below which a grid point leaves i
 @dataclass(frozen=True)
 class Member:
     """One test: `columns` (n, q) of an effect begun at `point`; the first one a secant (1 = all of `point`) if `secant`,
-    the others belong to `names`."""
+    the others belong to `names`. `kind` of hypothesis: one "shared" number, "one" parameter, or "several"."""
 
     effect: str
     point: dict[str, float]
     names: tuple[str, ...]
     columns: Array
     secant: bool = False
+    kind: str = "several"
 
     def start(self, amplitude: Array) -> dict[str, float]:
         """Parameters that the linear fit (q,) of the columns stands for; a secant within 0.3 to 2 of its point.
@@ -52,6 +55,29 @@ def merged(values: Parameters, effect: str, change: dict[str, float]) -> Values:
     """`values` with the parameters `change` of `effect` set."""
     out = {name: dict(parameters) for name, parameters in values.items()}
     out[effect] = {**out.get(effect, {}), **change}
+    return out
+
+
+def untied(values: Parameters, candidates: Mapping[str, Candidate]) -> Values:
+    """`values` without shared parameters, each of those that they stand for by its own name."""
+    out: Values = {}
+    for effect, given in values.items():
+        out[effect] = {n: v for n, v in given.items() if n not in candidates[effect].shared}
+        for name, each in candidates[effect].shared.items():
+            if name in given:
+                out[effect] |= {n: given.get(n, 0.0) + given[name] for n in each}
+    return out
+
+
+def tied(values: Parameters, candidates: Mapping[str, Candidate]) -> Values:
+    """`values` with parameters that may share a number, and are equal to the last digit, as the one that they share."""
+    out: Values = {effect: dict(given) for effect, given in values.items()}
+    for effect, given in out.items():
+        for name, each in candidates[effect].shared.items():
+            if all(n in given for n in each) and len({given[n] for n in each}) == 1:
+                given[name] = given[each[0]]
+                for n in each:
+                    del given[n]
     return out
 
 
@@ -83,5 +109,6 @@ def members(problem: ResidualProblem, values: Parameters, residual: Array, candi
             if secant:
                 columns = np.column_stack([change, columns])
         if columns.shape[1] and np.isfinite(columns).all() and np.any(columns):
-            found.append(Member(candidate.effect, dict(point), names, columns, secant))
+            kind = "several" if len(names) != 1 else "shared" if names[0] in candidate.shared else "one"
+            found.append(Member(candidate.effect, dict(point), names, columns, secant, kind))
     return found

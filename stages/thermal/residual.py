@@ -8,6 +8,11 @@ network could learn of x (`smooth.py`); f, the function that a lag acts on, is f
 belong to N: without them a lag "explains" clean instruments. f is that of x, unless x of some lag explains the data better
 beyond doubt: a function fitted to lagged features has learnt some of the very noise that it is then tested on.
 
+Of a single thermometer with three branches or more, N is a curve in T, with the rate where it predicts branches held out
+better by a tenth, unless one history for the whole unit does better still: rate and history are one another's image there.
+
+A is looked for as one number that the gyros share, one that the accelerometers share, one of each channel alone, and several.
+
 Functions
 ---------
 residual_problem    of chamber runs
@@ -15,7 +20,7 @@ residual_problem    of chamber runs
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -114,23 +119,10 @@ class Axis:
     def lags(self) -> bool:
         return self.number < 3 and bool(self.used[0])
 
-    def simplest(self, levels: Array, branch: Labels) -> Axis:
-        """Of a single thermometer, whose rate and history are one another's image: the curve in T, and whether the rate belongs
-        to it, that best predict branches (N,) held out. A richer model must do so by a tenth.
-        """
-        if not self.used[:2].all():
-            return self
-        best, lowest = self, np.inf
-        for rate in (False, True):
-            for degree in DEGREES:
-                used = self.used & np.array([True, rate])
-                trial = replace(self, used=used, degree=degree)
-                x = trial.scaled(self.features)
-                columns = np.column_stack([levels, x, Curve.of(degree, x, self.bias, levels, 1.0).columns])
-                missed = held_out(columns, self.bias, branch)
-                if missed < HELPS * lowest:
-                    best, lowest = trial, missed
-        return best
+    def curve(self, degree: int, temperature: Array) -> Array:
+        """Columns (N, degree) of a polynomial in a temperature (N,) that need not be the measured one."""
+        x = ((temperature - self.features[:, 0].mean()) / self.features[:, 0].std())[:, None]
+        return np.column_stack([x, Curve.of(degree, x, self.bias, np.ones((len(x), 1)), 1.0).columns])
 
 
 def _noise(bias: Array, starts: NDArray[np.bool_]) -> float:
@@ -162,7 +154,7 @@ def residual_problem(
     branch, called = _branches(runs, data.run, axes[0].features[:, 0])
     if data.thermometers == 1 and len(called) >= BRANCHES:
         group, names = branch, called
-        axes = [a.simplest(levels, branch) for a in axes]
+        axes = _simplest(axes, levels, branch, runs, settings)
     else:
         group = pieces(data.run)
         names = {int(k): f"stretches in turn, group {k + 1}" for k in np.unique(group)}
@@ -181,6 +173,59 @@ def _branches(runs: Sequence[Run], run: Labels, temperature: Array) -> tuple[Lab
             for k, up in enumerate(rising)
         }
     return group, names
+
+
+def _simplest(
+    axes: Sequence[Axis], levels: Array, branch: Labels, runs: Sequence[Run], settings: ThermalSettings
+) -> list[Axis]:
+    """Models of the channels of a single thermometer: the curve in T, and whether the rate belongs to it, that best predict
+    branches (N,) held out. A richer model must do so by a tenth.
+
+    Rate, lag and play are one another's image there (f(T_τ) ≈ f(T) − τ·f'·Ṫ). The rate of a channel gives way to history where
+    one history for the whole unit, beside curves in T alone, predicts better by a tenth in the mean over all channels.
+    """
+    if not all(a.used[:2].all() for a in axes):
+        return list(axes)
+    best, lowest = [], len(axes) * float(np.log(HELPS))
+    for axis in axes:
+        t = axis.features[:, 0]
+        degree, error = _degree(axis, levels, t, branch)
+        with_rate, lower = _degree(axis, np.column_stack([levels, axis.features[:, 1]]), t, branch)
+        rate = lower < HELPS * error
+        used = axis.used & np.array([True, rate])
+        best.append(replace(axis, used=used, degree=with_rate if rate else degree))
+        lowest += float(np.log(lower if rate else error))
+    for beside, temperature in _histories(axes, runs, settings):
+        trial, missed = [], 0.0
+        for axis, column, t in zip(axes, beside.T, temperature.T, strict=True):
+            degree, error = _degree(axis, np.column_stack([levels, column]), t, branch)
+            trial.append(replace(axis, used=axis.used & np.array([True, False]), degree=degree))
+            missed += float(np.log(error))
+        if missed < lowest:
+            best, lowest = trial, missed
+    return best
+
+
+def _histories(axes: Sequence[Axis], runs: Sequence[Run], settings: ThermalSettings) -> Iterator[tuple[Array, Array]]:
+    """For each width of a play, each lag: the column beside a channel's curve, and the temperature of that (N, axes)."""
+    numbers = [a.number for a in axes]
+    present = np.column_stack([a.features[:, 0] for a in axes])
+    span = float(np.ptp(present, axis=0).max())
+    for share in HALF_WIDTHS:
+        yield np.vstack([r.behind(share * span) for r in runs])[:, numbers], present
+    for lag in LAGS_S:
+        late = np.vstack([r.felt(lag, settings)[0] for r in runs])[:, numbers]
+        yield np.zeros_like(present), np.where([a.lags for a in axes], late, present)
+
+
+def _degree(axis: Axis, flat: Array, temperature: Array, branch: Labels) -> tuple[int, float]:
+    """Degree of the curve in a temperature (N,), beside columns `flat` (N, p), and its RMS in branches held out."""
+    best, lowest = 1, np.inf
+    for degree in DEGREES:
+        missed = held_out(np.column_stack([flat, axis.curve(degree, temperature)]), axis.bias, branch)
+        if missed < HELPS * lowest:
+            best, lowest = degree, missed
+    return best, max(lowest, 1e-300)
 
 
 @dataclass(frozen=True)
@@ -234,7 +279,7 @@ class _Builder:
             for i, axis in enumerate(self.axes):
                 sensor, letter = CHANNELS[axis.number].split("_")
                 left = bias[i]
-                if size := play.get(f"{sensor}.{letter}", 0.0):
+                if size := play.get(f"{sensor}.{letter}", 0.0) + play.get(sensor, 0.0):
                     left = left - size * behind(play["half_width"])[:, axis.number]
                 if lag > 0.0 and i in functions:
                     left = left - (functions[i](axis.scaled(self._lagged(axis, felt(lag)))) - null[i])
@@ -323,13 +368,21 @@ class _Builder:
                 size = min(PLAUSIBLE_SHARE * float(axis.bias.std()), effect.largest[key])
                 parameters[name] = Parameter(effect.units[key], effect.largest[key], plausible=size)
         names = [name for name in parameters if name != "half_width"]
+        shared = {}
+        for sensor in ("gyro", "accel"):
+            mine = tuple(n for n in names if n.startswith(sensor))
+            if len(mine) > 1:
+                size = float(np.median([parameters[n].size for n in mine]))
+                parameters[sensor] = replace(parameters[mine[0]], plausible=size)
+                shared[sensor] = mine
         sets = {tuple(n for n in names if n.startswith(which)) for which in ("", "gyro", "accel", *names)} - {()}
+        sets |= {(sensor,) for sensor in shared}
         grid = [
-            {"half_width": h} | {n: 0.0 for n in names if n not in some}
+            {"half_width": h} | {n: 0.0 for n in parameters if n not in some and n != "half_width"}
             for h in widths
-            for some in sorted(sets, key=len)
+            for some in sorted(sets, key=lambda s: (len(s), s))
         ]
-        return Candidate("thermal_hysteresis", parameters, tuple(grid))
+        return Candidate("thermal_hysteresis", parameters, tuple(grid), shared)
 
     def _lag(self, total: float) -> Candidate:
         effect = EFFECTS["thermal_lag"]

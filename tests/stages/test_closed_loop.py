@@ -17,11 +17,12 @@ from pipeline.records import Bench
 from pipeline.residual_problem import Basis, Candidate, Parameter, Parameters, ResidualProblem
 from stages.bench import BenchSettings, residual_problem
 from stages.bench import run as bench_stage
-from stages.closed_loop import LoopSettings, run, taken_back
+from stages.closed_loop import LoopSettings, refit, run, taken_back
 from stages.closed_loop.confirmation import controls, controls_fail
 from stages.closed_loop.learned import knots, spline_columns
 from stages.closed_loop.noise import Colour, Layout, basis, criterion, fit_noise, gram, log_det
-from stages.closed_loop.score_test import family_wise, log_tail
+from stages.closed_loop.score_test import family_wise, log_counts, log_tail
+from stages.closed_loop.signatures import tied, untied
 
 SHARED = Path(os.environ.get("TSMFTIS_SHARED", Path(__file__).parents[2].parent / "shared")) / "data" / "opus"
 real_data = pytest.mark.skipif(not SHARED.is_dir(), reason=f"measured OPUS files are not in {SHARED}")
@@ -440,3 +441,83 @@ def test_measured_interferograms_of_linear_detectors_lack_nothing(name: str) -> 
     pytest.importorskip("brukeropus")
     result = run(residual_problem(read_opus(SHARED / name)), QUICK, 1)
     assert result.verdict == "no_effect" and result.steps == ()
+
+
+SENSORS = ("x", "y", "z")
+
+
+def triad(seed: int, sizes: tuple[float, float, float], drift: float = 0.0) -> ResidualProblem:
+    """Three sensors of 240 samples in unit white noise; the same wave in each, `sizes` times, in the last one growing by
+    `drift`. Tested as one number for all three, for each alone, and as three numbers."""
+    rng = np.random.default_rng(seed)
+    n, groups = 240, 8
+    time = np.linspace(-1.0, 1.0, n)
+    wave = np.sin(40.0 * time + 0.3)
+    y = rng.standard_normal((3, n)) + np.outer(sizes, wave)
+    y[2] += drift * time * wave
+
+    def residual(parameters: Parameters) -> np.ndarray:
+        given = parameters.get("wave", {})
+        size = [given.get(f"s.{a}", 0.0) + given.get("s", 0.0) for a in SENSORS]
+        return (y - np.outer(size, wave)).ravel()
+
+    names = tuple(f"s.{a}" for a in SENSORS)
+    every = (*names, "s")
+    sets = (("s",), *((one,) for one in names), names)
+    candidate = Candidate(
+        "wave",
+        {name: Parameter("1", 50.0, plausible=1.0) for name in every},
+        tuple({n: 0.0 for n in every if n not in some} for some in sets),
+        {"s": names},
+    )
+    late = np.full((3, n), np.nan)
+    late[2] = time
+    return ResidualProblem(
+        stage="made-up",
+        residual=residual,
+        candidates=(candidate,),
+        group=np.tile(np.arange(n) * groups // n, 3),
+        series=np.repeat(np.arange(3), n),
+        time=np.tile(time, 3),
+        nuisance=np.kron(np.eye(3), np.ones((n, 1))),
+        channel=np.repeat(np.arange(3), n),
+        covariates={"time (z)": late.ravel()},
+    )
+
+
+def test_sensors_of_one_make_share_a_number_until_the_data_tell_them_apart() -> None:
+    problem = triad(1, (0.5, 0.5, 0.5))
+    result = run(problem, QUICK, 1)
+    found = result.steps[0].parameters
+    assert set(found) == {"s.x", "s.y", "s.z"} == set(result.values["wave"])
+    assert len({(v.value, v.sigma) for v in found.values()}) == 1
+    assert abs(found["s.x"].value - 0.5) < 3.0 * found["s.x"].sigma < 0.25
+    assert refit(problem, result.values, [0])["wave"]["s.x"] == refit(problem, result.values, [0])["wave"]["s.z"]
+    apart = run(triad(2, (1.0, 1.0, 2.0)), QUICK, 1).steps[0].parameters
+    assert len({v.value for v in apart.values()}) == 3
+    for name, truth in (("s.x", 1.0), ("s.y", 1.0), ("s.z", 2.0)):
+        assert abs(apart[name].value - truth) < 3.0 * apart[name].sigma
+
+
+def test_a_size_that_is_not_told_from_zero_is_left_out() -> None:
+    found = run(triad(3, (1.0, -1.0, 0.0)), QUICK, 1).steps[0].parameters
+    assert set(found) == {"s.x", "s.y"}
+
+
+def test_a_sensor_in_which_the_size_changes_is_left_out_and_the_others_are_not() -> None:
+    result = run(triad(4, (1.0, -1.0, 1.0), drift=3.0), QUICK, 1)
+    assert set(result.steps[0].parameters) == {"s.x", "s.y"}
+    assert any("time (z)" in note for note in result.notes)
+
+
+def test_shared_numbers_and_their_names() -> None:
+    candidates = {c.effect: c for c in triad(5, (0.0, 0.0, 0.0)).candidates}
+    assert untied({"wave": {"s": 2.0}}, candidates) == {"wave": {"s.x": 2.0, "s.y": 2.0, "s.z": 2.0}}
+    assert tied({"wave": {"s.x": 2.0, "s.y": 2.0, "s.z": 2.0}}, candidates) == {"wave": {"s": 2.0}}
+    assert tied({"wave": {"s.x": 2.0, "s.y": 2.0}}, candidates) == {"wave": {"s.x": 2.0, "s.y": 2.0}}
+
+
+def test_each_kind_of_hypothesis_pays_for_its_own_tests() -> None:
+    effects = ["a", "a", "a", "a", "b", "c", "c"]
+    kinds = ["shared", "one", "one", "one", "several", "one", "one"]
+    np.testing.assert_allclose(np.exp(log_counts(effects, kinds)), [2, 6, 6, 6, 1, 2, 2])

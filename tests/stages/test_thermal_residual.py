@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import loop_chamber
 import numpy as np
 import pytest
 
@@ -16,9 +17,11 @@ from stages.closed_loop import LoopSettings, run
 from stages.thermal import ThermalSettings, residual_problem
 from stages.thermal.branches import branches, pieces
 from stages.thermal.smooth import Curve, Kernel, Smooth
+from stages.thermal.targets import CHANNELS
 from tsmftis.inertial import DEG_PER_H
 
 SHARED = Path(os.environ.get("TSMFTIS_SHARED", "/nowhere")) / "campaigns"
+LOG = SHARED.parent / "data" / "imu_thermal" / "tofupilot_imu_raw_data.csv"
 
 
 def chamber(seed: int, play: float = 0.0, cycles: float = 1.5, hours: float = 2.0) -> Chamber:
@@ -67,6 +70,35 @@ def test_a_play_is_found_in_a_run_of_one_thermometer_and_not_invented() -> None:
     assert [s.effect for s in result.steps] == ["thermal_hysteresis"]
     found = result.steps[0].parameters
     assert abs(found["half_width"].value - 5.0) < 4.0 * found["half_width"].sigma
+
+
+@pytest.mark.parametrize("rate", [2e-7, 1e-6])
+def test_a_rate_that_belongs_to_a_single_thermometer_is_no_memory(rate: float) -> None:
+    """Bias in proportion to dT/dt, which the stage's own network learns: no branch is predicted better by a history."""
+    plain = chamber(12)
+    slope = np.gradient(plain.temperatures.gyro[:, 0, 0], plain.time)
+    with_rate = replace(plain, gyro=plain.gyro + rate * (slope / np.abs(slope).max())[:, None])
+    assert not run(residual_problem([with_rate], [], ThermalSettings()), LoopSettings(), 1).steps
+
+
+@pytest.mark.skipif(not LOG.is_file(), reason=f"the measured log {LOG.name} is not there")
+def test_memory_halves_what_is_held_out_of_a_real_log() -> None:
+    """A consumer unit, one thermometer, three branches: gyro x and accelerometer z have a history, gyro z none."""
+    problem = residual_problem([loop_chamber.chamber(LOG)], [], ThermalSettings())
+    result = run(problem, LoopSettings(), 1)
+    assert result.steps[0].effect == "thermal_hysteresis"
+    before, after = loop_chamber.by_channel(problem, {}), loop_chamber.by_channel(problem, result.values)
+    ratio = dict(zip(CHANNELS, np.divide(after, before).tolist(), strict=True))
+    assert ratio["gyro_x"] < 0.65 and ratio["accel_z"] < 0.5
+    assert max(ratio.values()) < 1.01 and ratio["gyro_z"] > 0.95
+
+
+def test_gyros_of_one_make_are_one_number() -> None:
+    problem = residual_problem([chamber(13)], [], ThermalSettings())
+    both = {"half_width": 5.0, "gyro": 1e-7}
+    each = {"half_width": 5.0} | {f"gyro.{a}": 1e-7 for a in "xyz"}
+    apart = problem.residual({"thermal_hysteresis": each})
+    np.testing.assert_allclose(problem.residual({"thermal_hysteresis": both}), apart, rtol=1e-12)
 
 
 def test_a_single_cooling_tells_no_memory() -> None:
