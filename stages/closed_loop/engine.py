@@ -547,10 +547,12 @@ def _drop_unneeded(
         for effect in e.values:
             own = [p + c for c in e.columns(effect)]
             others = [p + c for c in range(len(e.order)) if p + c not in own]
-            at = np.array([e.values[effect][e.order[c - p][1]] for c in own])
-            information = project(m, others)[np.ix_(own, own)]
-            rank = sum(bool(v > 0.0) for v in np.diag(information)) or 1
-            p_value = float(chdtrc(rank, max(at @ information @ at, 0.0))) * max(len(candidates[effect].grid), 1)
+            # What it contributes, not its parameters times their derivatives: a width or a thickness is no evidence.
+            term = np.asarray(problem.residual({k: v for k, v in e.values.items() if k != effect}), float) - e.residual
+            rank = sum(bool(m[c, c] > 0.0) for c in own) or 1
+            beside = np.column_stack([whole, term[rows]])
+            left = project(project(gram(layout, e.noise, beside), slice(0, p)), others)[-1, -1]
+            p_value = float(chdtrc(rank, max(left, 0.0))) * max(len(candidates[effect].grid), 1)
             if effect != last and p_value > highest:
                 weakest, highest = effect, p_value
         if not weakest:

@@ -27,7 +27,7 @@ residual_problem    of one flight
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numba
@@ -240,13 +240,15 @@ def residual_problem(
     effects, lag = effects or {}, 0.0
     for _ in range(LAG_ROUNDS):
         solution = _widely_estimated(imu, gnss, model, mounting, settings, initial, correction, effects)
-        innovations = _innovations(solution, model, settings, declared(mounting, effects))
+        theta = declared(mounting, effects)
+        innovations = _innovations(solution, model, settings, theta)
         first = innovations.at(np.zeros(len(innovations.order)))
         count = first.residual.size // innovations.chosen.size
         if count == VELOCITIES or gnss.velocity is None:
             break
-        signatures = np.column_stack([first.signatures, first.velocity_lag])
-        more, sigma = _beside_all(signatures, first.residual, signatures.shape[1] - 1)
+        near = innovations.at(_apart(solution, innovations.order, theta))
+        signatures = np.column_stack([near.signatures, near.velocity_lag])
+        more, sigma = _beside_all(signatures, near.residual, signatures.shape[1] - 1)
         if abs(more) < TOLD * sigma:
             break
         lag += more
@@ -274,6 +276,14 @@ def residual_problem(
         group_names=names,
         notes=notes,
     )
+
+
+def _apart(solution: Solution, order: Sequence[tuple[str, str]], theta: Array) -> Array:
+    """What `solution` estimates of the parameters, in their order, beyond θ: a latency far from it bends everything else."""
+    estimated = solution.theta()[-1]
+    estimated[states.parameter("gnss_latency")] += solution.problem.latency
+    places = [states.parameter(e).start + list(EFFECTS[e].units).index(name) for e, name in order]
+    return np.asarray((estimated - theta)[places])
 
 
 def _innovations(solution: Solution, model: ImuModel, settings: NavigationSettings, theta: Array) -> Innovations:
@@ -389,9 +399,10 @@ def _temperature(imu: Imu) -> tuple[Array, Array] | None:
 
 def _acceleration(solution: Solution, chosen: NDArray[np.int64]) -> Array:
     """Of the unit at these fixes (k, 3), north, east, down [m/s²]."""
-    store, time = solution.store, solution.problem.gnss.time[chosen]
+    store, fixes = solution.store, solution.gathered.of_fix[chosen]
+    time = solution.gathered.measurements.time[fixes]
     k = np.searchsorted(solution.problem.imu.time, time).clip(0, store.epoch.size - 1)
-    force = solution.gathered.measurements.force[solution.gathered.of_fix[chosen]]
+    force = solution.gathered.measurements.force[fixes]
     return np.einsum("kij,kj->ki", quaternion_to_dcm(store.q[k]), force) + np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 
