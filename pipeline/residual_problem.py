@@ -146,8 +146,8 @@ class ResidualProblem:
 def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
     """Problems of one instrument under one set of parameters, by name (a flight's), one after the other.
 
-    Groups, series, channels and nuisance are each problem's own; candidates, sigma and floor those of the first; covariates those
-    that all have, but for bases. A single problem stays as it is.
+    Groups, series, channels, notes and nuisance are each problem's own; candidates, sigma and floor those of the first; covariates
+    those that all have, but for bases. A single problem stays as it is.
     """
     parts = list(problems.values())
     first = parts[0]
@@ -175,4 +175,5 @@ def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
         nuisance=block_diag(*(part.nuisance for part in parts)),
         covariates={k: np.concatenate([one[k] for one in plain]) for k in shared},
         group_names=names,
+        notes=tuple(f"{name}: {note}" for name, part in problems.items() for note in part.notes),
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from flows.loop.problems import Part, inputs_of, picked_px, problem_of, settings_of
-from flows.loop.withheld import withheld_m, worse
+from flows.loop.withheld import Misses, size, withheld_m
 from flows.steps import Paths, Plan, plain
 from pipeline.datasets import write_dataset
 from pipeline.errors import StageError
@@ -29,7 +30,10 @@ from stages.closed_loop import LoopResult
 from tsmftis.effects import EFFECTS, nested, scalars
 
 FOLDER = "loop"
-TAKEN_BACK = "withheld fixes are missed by {0:.3g} m horizontally, {1:.3g} m vertically without it, {2:.3g} and {3:.3g} m with it"
+WORSE = 0.01  # by which an effect may make withheld fixes worse: as much is chance, of one that hardly shows
+TAKEN_BACK = (
+    "withheld fixes are missed by {0:.3g} m horizontally, {1:.3g} m vertically with it, {2:.3g} and {3:.3g} m without"
+)
 
 
 def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
@@ -38,10 +42,9 @@ def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
     def work(to: Paths) -> dict[str, Any]:
         with threadpool_limits(limits=1), _telling(part):
             problem = problem_of(plan, part)
-            result = closed_loop.run(problem, plan.settings.closed_loop, seed)
-            missed = withheld_m(plan, result.values) if part.stage == "navigation" and result.values else None
-            if missed is not None and worse(missed, plan.settings.closed_loop.gain):
-                result = closed_loop.taken_back(result, TAKEN_BACK.format(*missed[0], *missed[1]))
+            result, missed = closed_loop.run(problem, plan.settings.closed_loop, seed), None
+            if part.stage == "navigation":
+                result, missed = _held_against_fixes(plan, problem, result, seed)
             content = content_of(part, problem, result)
             if part.stage == "navigation":
                 content["withheld_m"] = None if missed is None else dict(zip(("before", "after"), missed, strict=True))
@@ -79,6 +82,30 @@ def _telling(part: Part) -> Iterator[None]:
         yield
     except (ArithmeticError, RuntimeError, ValueError) as error:  # numpy's and torch's linear algebra among them
         raise StageError(f"no residual of the part {part.name} could be examined: {error}") from error
+
+
+def _held_against_fixes(
+    plan: Plan, problem: ResidualProblem, result: LoopResult, seed: int
+) -> tuple[LoopResult, Misses | None]:
+    """The answer without effects that make fixes worse, which neither path nor effects have seen; how far these are missed."""
+    first, out = result, dict[str, str]()
+    while True:
+        missed = withheld_m(plan, result.values) if result.values else None
+        if missed is None:
+            break
+        without: dict[str, list[float]] = {}
+        for effect in result.values:
+            rest = {name: v for name, v in result.values.items() if name != effect}
+            other = withheld_m(plan, rest) if rest else missed
+            if other is not None:
+                without[effect] = other[1] if rest else missed[0]
+        effect = min(without, key=lambda name: size(without[name]))
+        if size(missed[1]) <= (1.0 + WORSE) * size(without[effect]):
+            break
+        out[effect] = TAKEN_BACK.format(*missed[1], *without[effect])
+        kept = tuple(c for c in problem.candidates if c.effect not in out)
+        result = closed_loop.run(replace(problem, candidates=kept), plan.settings.closed_loop, seed)
+    return closed_loop.taken_back(result, out, first.considered) if out else result, missed
 
 
 def content_of(part: Part, problem: ResidualProblem, result: LoopResult) -> dict[str, Any]:

@@ -184,9 +184,9 @@ def _navigation(plan: Plan) -> ResidualProblem:
             failed[flight.id] = error
     if not problems:
         raise next(iter(failed.values()))
-    return replace(
-        joined(problems), notes=tuple(f"flight {name} was not looked at: {error}" for name, error in failed.items())
-    )
+    every = joined(problems)
+    told = [f"flight {name} was not looked at: {error}" for name, error in failed.items()]
+    return replace(every, notes=(*every.notes, *told))
 
 
 def geometry_of(plan: Plan, motion: bool = True) -> dict[str, Any]:

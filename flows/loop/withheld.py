@@ -3,12 +3,13 @@
 Functions
 ---------
 withheld_m    misses of withheld fixes without the effects and with them
-worse         whether they grew
+size          a single figure of them
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -51,7 +52,6 @@ def withheld_m(plan: Plan, effects: Parameters) -> Misses | None:
     return missed[0], missed[1]
 
 
-def worse(missed: Misses, share: float) -> bool:
-    """Whether misses (before, after) grew by more than a share, all three components together."""
-    before, after = (math.hypot(*one) for one in missed)
-    return after > (1.0 + share) * before
+def size(missed: Sequence[float]) -> float:
+    """Geometric mean of horizontal and vertical misses [m]: neither hides the other."""
+    return math.sqrt(math.prod(missed))

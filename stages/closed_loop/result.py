@@ -1,11 +1,11 @@
 """What the loop answers for one stage: the parts of loop.json that are its own, and what a person reads.
 
-`taken_back` is the answer once what was added has failed on data that the engine does not have.
+`taken_back` is the answer once some of what was added has failed on data that the engine does not have.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -126,17 +126,14 @@ class LoopResult:
         }
 
 
-def taken_back(result: LoopResult, why: str) -> LoopResult:
-    """Without its steps: something is there, and what was added is not it."""
-    names = [step.effect for step in result.steps]
-    outcome = f"taken back: {why}"
+def taken_back(result: LoopResult, why: Mapping[str, str], considered: Sequence[Considered]) -> LoopResult:
+    """The answer of a library without some effects, that an answer with them had added: effect → what speaks against it;
+    `considered`: of the whole library. Where nothing else is added, something is there, and what was added is not it."""
+    outcome = {name: f"taken back: {text}" for name, text in why.items()}
+    known = {one.effect: one for one in (*considered, *result.considered)}
     return replace(
         result,
-        verdict="unexplained",
-        steps=(),
-        values={},
-        rms_after=result.rms_before,
-        notes=(*result.notes, f"{', '.join(names)} taken back: {why}"),
-        considered=tuple(replace(c, outcome=outcome) if c.effect in names else c for c in result.considered),
-        pictures=Pictures(result.pictures.before, result.pictures.before, {}),
+        verdict=result.verdict if result.steps or not why else "unexplained",
+        notes=(*result.notes, *(f"{name} {text}" for name, text in outcome.items())),
+        considered=tuple(replace(one, outcome=outcome.get(name, one.outcome)) for name, one in known.items()),
     )

@@ -237,9 +237,9 @@ def residual_problem(
     Velocities that lag beyond doubt are moved to their positions' instants first: fixes would be refused for them.
     Raises InputError as `run` does, and where too few fixes are left.
     """
-    effects, lag = effects or {}, 0.0
+    effects, moved, lag, sigma = effects or {}, gnss, 0.0, float("inf")
     for _ in range(LAG_ROUNDS):
-        solution = _widely_estimated(imu, gnss, model, mounting, settings, initial, correction, effects)
+        solution = _widely_estimated(imu, moved, model, mounting, settings, initial, correction, effects)
         theta = declared(mounting, effects)
         innovations = _innovations(solution, model, settings, theta)
         first = innovations.at(np.zeros(len(innovations.order)))
@@ -252,8 +252,7 @@ def residual_problem(
         if abs(more) < TOLD * sigma:
             break
         lag += more
-        moved = gnss.velocity + more * _acceleration(solution, np.arange(gnss.time.size))
-        gnss = replace(gnss, velocity=np.where(np.isfinite(moved), moved, gnss.velocity))
+        moved = replace(gnss, velocity=gnss.velocity + _change(solution, lag))
     chosen = innovations.chosen
     notes: tuple[str, ...] = ()
     if lag != 0.0:
@@ -284,6 +283,15 @@ def _apart(solution: Solution, order: Sequence[tuple[str, str]], theta: Array) -
     estimated[states.parameter("gnss_latency")] += solution.problem.latency
     places = [states.parameter(e).start + list(EFFECTS[e].units).index(name) for e, name in order]
     return np.asarray((estimated - theta)[places])
+
+
+def _change(solution: Solution, lag: float) -> Array:
+    """Of the unit's velocity (fix, 3) over the lag [s] that ends at each fix."""
+    store, at = solution.store, solution.problem.imu.time
+    n = min(at.size, store.velocity.shape[0], store.epoch.size)
+    time = solution.gathered.measurements.time[solution.gathered.of_fix]
+    v = [[np.interp(t, at[:n], axis) for axis in store.velocity[:n].T] for t in (time, time - lag)]
+    return np.asarray(np.stack(v[0], -1) - np.stack(v[1], -1))
 
 
 def _innovations(solution: Solution, model: ImuModel, settings: NavigationSettings, theta: Array) -> Innovations:
