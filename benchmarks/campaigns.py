@@ -63,13 +63,14 @@ def thermal_ratios(campaign: Path, truth: Path, run: dict[str, Any]) -> dict[str
 
 
 def withheld(campaign: Path, truth: Path, run: Path) -> str:
-    """Misses of fixes that the campaign does not hold [m], at the antenna, where the run's model update has it."""
+    """Misses of fixes that the campaign does not hold [m], at the antenna and instants where the run's model update has them."""
     lever = np.array(yaml.safe_load((campaign / "instrument.yaml").read_text())["mounting"]["imu_to_antenna_m"])
     update = json.loads((run / "run.json").read_text())["provenance"]["model_update"].get("effects", {})
     lever += [update.get("antenna_lever_arm", {}).get(axis, 0.0) for axis in "xyz"]
     fixes = np.load(truth / "withheld.npz")["gnss"]
+    late = update.get("gnss_latency", {}).get("latency", 0.0)
     with xr.open_dataset(next(run.glob("*/trajectory.nc"))) as d:
-        time = fixes[:, 0]
+        time = fixes[:, 0] - late
         north = np.deg2rad(fixes[:, 1] - np.interp(time, d.time, d.latitude)) * 6.36e6
         east = np.deg2rad(fixes[:, 2] - np.interp(time, d.time, d.longitude)) * 6.38e6 * np.cos(np.deg2rad(fixes[0, 1]))
         up = fixes[:, 3] - np.interp(time, d.time, d.height)

@@ -161,6 +161,8 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
     }
     if update := plan.effects("navigation"):
         about["model_update"] = json.dumps(update, sort_keys=True)
+    if lag := plan.update.velocity_lag(flight):
+        about["velocity_lag_s"] = f"{lag:.6g}"
     method = plan.settings.thermal.method
     if compensated := compensation(plan, flight) != "none":
         inputs["model"] = needed(model, "thermal")
@@ -183,6 +185,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
                 initial=initial_attitude(campaign, flight),
                 correction=correction,
                 effects=plan.effects("navigation"),
+                velocity_lag=plan.update.velocity_lag(flight),
             )
         if correction is not None:
             write_dataset(correction.to_dataset(), to["correction"])
@@ -204,6 +207,7 @@ def navigation_step(plan: Plan, flight: str) -> StageRecord:
         {
             "settings": plain(plan.settings.navigation),
             "effects": plan.effects("navigation"),
+            "velocity_lag": plan.update.velocity_lag(flight),
             "thermal": method,
             "about": about,
             "imu": plain(instrument.imu),

@@ -6,10 +6,13 @@
       antenna_lever_arm: {x: 0.1, y: 0.0, z: -0.2}
     bench:                          # optional
       mct: {detector_nonlinearity: {a: -0.015}}
+    receiver:                       # optional
+      F1: {velocity_lag_s: 0.04}
     learned:                        # optional
       - {stage: thermal, covariate: time, unit: rad s-1, table: {covariate: [0, 10], value: [0.0, 1.0e-7]}}
 
 Names, parameters and units are those of `tsmftis.effects`; a parameter left out is zero, one of three axes a list of three.
+A receiver whose velocities lag their positions has them at an earlier instant, flight by flight.
 A laboratory interferogram that `bench` names has its own effects and not those of `effects`: its detector is another one.
 Learned terms are what the closed loop found without a name: curves of what is left over a covariate. Those of the geometry that
 are curves of what a frame is under (time, temperature, attitude, …) turn the camera (`stages.tracking.learned`); no model
@@ -36,7 +39,8 @@ from pipeline.yaml_file import load_yaml
 from tsmftis.effects import EFFECTS, Effect
 
 FORMAT = "tsmftis-model-update/1"
-SECTIONS = ("format", "effects", "bench", "learned")
+SECTIONS = ("format", "effects", "bench", "learned", "receiver")
+RECEIVER, LARGEST_LAG_S = "velocity_lag_s", 2.0
 LEARNED = ("stage", "covariate", "unit", "table")
 MAY_HAVE = {"covariate_unit"}
 Effects = dict[str, dict[str, Any]]  # floats, and tuples of three where an effect has lists
@@ -44,12 +48,18 @@ Effects = dict[str, dict[str, Any]]  # floats, and tuples of three where an effe
 
 @dataclass(frozen=True)
 class ModelUpdate:
-    """`effects` of the campaign's instrument; `bench`: those of single laboratory interferograms; `learned`: curves on record,
+    """`effects` of the campaign's instrument; `receiver`: lag of velocities, by flight; `bench`: effects of single laboratory
+    interferograms; `learned`: curves on record,
     each with stage, covariate, unit of the curve and table {covariate: […], value: […]}, and the covariate's unit where known."""
 
     effects: Effects = field(default_factory=dict)
     bench: Mapping[str, Effects] = field(default_factory=dict)
     learned: tuple[Mapping[str, Any], ...] = ()
+    receiver: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    def velocity_lag(self, flight: str) -> float:
+        """Of the velocities of a flight's receiver against its positions [s]."""
+        return float(self.receiver.get(flight, {}).get(RECEIVER, 0.0))
 
 
 def read_model_update(path: Path) -> ModelUpdate:
@@ -66,6 +76,7 @@ def read_model_update(path: Path) -> ModelUpdate:
         _effects(path, "effects", content.get("effects") or {}),
         {str(name): _effects(path, f"bench.{name}", given or {}) for name, given in bench.items()},
         _learned(path, content.get("learned") or []),
+        _receiver(path, content.get("receiver") or {}),
     )
 
 
@@ -74,6 +85,8 @@ def write_model_update(update: ModelUpdate, path: Path) -> None:
     content: dict[str, Any] = {"format": FORMAT, "effects": _listed(update.effects)}
     if update.bench:
         content["bench"] = {name: _listed(effects) for name, effects in update.bench.items()}
+    if update.receiver:
+        content["receiver"] = {flight: dict(values) for flight, values in update.receiver.items()}
     if update.learned:
         content["learned"] = [dict(one) for one in update.learned]
     text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
@@ -92,6 +105,20 @@ def _effects(path: Path, section: str, effects: Any) -> Effects:
     if not isinstance(effects, dict):
         raise InputError(path, f"key '{section}'", "holds no keys", "write  effects: {gnss_latency: {latency: 0.04}}")
     return {name: _effect(path, f"{section}.{name}", name, given) for name, given in effects.items()}
+
+
+def _receiver(path: Path, given: Any) -> dict[str, dict[str, float]]:
+    shape = f"write  receiver: {{F1: {{{RECEIVER}: 0.04}}}}"
+    if not isinstance(given, dict) or not all(isinstance(v, dict) and set(v) == {RECEIVER} for v in given.values()):
+        raise InputError(path, "key 'receiver'", "names no flights with their receivers' lag", shape)
+    out = {}
+    for flight, values in given.items():
+        lag = values[RECEIVER]
+        place = f"key 'receiver.{flight}.{RECEIVER}'"
+        if isinstance(lag, bool) or not isinstance(lag, int | float) or not abs(lag) <= LARGEST_LAG_S:
+            raise InputError(path, place, f"is {lag!r}", f"give seconds, {LARGEST_LAG_S:g} at most either way")
+        out[str(flight)] = {RECEIVER: float(lag)}
+    return out
 
 
 def _learned(path: Path, given: Any) -> tuple[Mapping[str, Any], ...]:

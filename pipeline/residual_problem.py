@@ -106,6 +106,7 @@ class ResidualProblem:
     floor       RMS of the residual that is the method's own accuracy: below it nothing is looked for
     unit        of the residual, for a reader
     notes       what a reader must be told of the data, such as what was left out
+    beside      what was estimated of the instrument beforehand, that is no candidate, by name
     """
 
     stage: str
@@ -122,6 +123,7 @@ class ResidualProblem:
     unit: str = "1"
     group_names: Mapping[int, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    beside: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = self.group.size
@@ -146,8 +148,8 @@ class ResidualProblem:
 def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
     """Problems of one instrument under one set of parameters, by name (a flight's), one after the other.
 
-    Groups, series, channels, notes and nuisance are each problem's own; candidates, sigma and floor those of the first; covariates
-    those that all have, but for bases. A single problem stays as it is.
+    Groups, series, channels, notes and nuisance are each problem's own; candidates, sigma and floor those of the first;
+    covariates those that all have, but for bases. A single problem stays as it is.
     """
     parts = list(problems.values())
     first = parts[0]

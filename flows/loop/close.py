@@ -168,7 +168,7 @@ def _take_over(before: Path, after: Path) -> None:
 
 def _changes(update: ModelUpdate) -> bool:
     """Whether it changes what a run over the campaign makes of its flights."""
-    return bool(update.effects or tracking.applied(update.learned))
+    return bool(update.effects or update.receiver or tracking.applied(update.learned))
 
 
 def _with(update: ModelUpdate, part: Part, answer: dict[str, Any], alone: bool) -> ModelUpdate:
@@ -178,7 +178,11 @@ def _with(update: ModelUpdate, part: Part, answer: dict[str, Any], alone: bool) 
         name: {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
         for name, values in answer["effects"].items()
     }
-    update = replace(update, learned=(*update.learned, *learned_of(answer)))
+    update = replace(
+        update,
+        learned=(*update.learned, *learned_of(answer)),
+        receiver={**update.receiver, **answer.get("receiver", {})},
+    )
     if part.bench is not None and not alone:
         return replace(update, bench={**update.bench, part.bench: effects})
     return replace(update, effects={**update.effects, **effects})

@@ -18,7 +18,7 @@ import numpy as np
 import xarray as xr
 from threadpoolctl import threadpool_limits
 
-from flows.loop.problems import Part, inputs_of, picked_px, problem_of, settings_of
+from flows.loop.problems import Part, inputs_of, picked_px, problem_of, receivers_of, settings_of
 from flows.loop.withheld import Misses, size, withheld_m
 from flows.steps import Paths, Plan, plain
 from pipeline.datasets import write_dataset
@@ -48,6 +48,9 @@ def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
             content = content_of(part, problem, result)
             if part.stage == "navigation":
                 content["withheld_m"] = None if missed is None else dict(zip(("before", "after"), missed, strict=True))
+                content["receiver"] = receivers_of(problem)
+                if content["receiver"] and content["verdict"] == "no_effect":
+                    content["verdict"] = "unexplained"  # and told in the notes
             if part.stage == "geometry":
                 learned = [one["covariate"] for one in tracking.applied(learned_of(content))]
                 content["picked_px"] = picked_px(plan, result.values, learned)
@@ -90,15 +93,15 @@ def _held_against_fixes(
     """The answer without effects that make fixes worse, which neither path nor effects have seen; how far these are missed."""
     first, out = result, dict[str, str]()
     while True:
-        missed = withheld_m(plan, result.values) if result.values else None
-        if missed is None:
+        missed = withheld_m(plan, result.values) if result.values or problem.beside else None
+        if missed is None or not result.values:
             break
         without: dict[str, list[float]] = {}
         for effect in result.values:
             rest = {name: v for name, v in result.values.items() if name != effect}
-            other = withheld_m(plan, rest) if rest else missed
+            other = withheld_m(plan, rest)
             if other is not None:
-                without[effect] = other[1] if rest else missed[0]
+                without[effect] = other[1]
         effect = min(without, key=lambda name: size(without[name]))
         if size(missed[1]) <= (1.0 + WORSE) * size(without[effect]):
             break

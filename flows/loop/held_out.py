@@ -44,7 +44,11 @@ Answers = Mapping[str, Mapping[str, Any]]
 def held_out_step(root: Path, before: Plan, last: Plan, answers: Answers, runs: tuple[Figures, Figures]) -> StageRecord:
     """`root`/loop/held-out.json: {"before", "after", "how"}. `before`, `last`: the plans of the first and the last run; `runs`:
     the content of their run.json."""
-    added = {name for name, answer in answers.items() if answer["effects"] and not answer["bench"]}
+    added = {
+        name
+        for name, answer in answers.items()
+        if (answer["effects"] or answer.get("receiver")) and not answer["bench"]
+    }
     first, second = (_of_run(run, before) for run in runs)
     if picked := answers.get("geometry", {}).get("picked_px"):
         first["geometry_residual_px"], second["geometry_residual_px"] = picked["before"], picked["after"]

@@ -186,7 +186,17 @@ def _navigation(plan: Plan) -> ResidualProblem:
         raise next(iter(failed.values()))
     every = joined(problems)
     told = [f"flight {name} was not looked at: {error}" for name, error in failed.items()]
-    return replace(every, notes=(*every.notes, *told))
+    beside = {f"{flight}/{name}": v for flight, one in problems.items() for name, v in one.beside.items()}
+    return replace(every, notes=(*every.notes, *told), beside=beside)
+
+
+def receivers_of(problem: ResidualProblem) -> dict[str, dict[str, float]]:
+    """What navigation's part tells of the flights' receivers, as a model update has it."""
+    out: dict[str, dict[str, float]] = {}
+    for place, value in problem.beside.items():
+        flight, name = place.rsplit("/", 1)
+        out.setdefault(flight, {})[name] = value
+    return out
 
 
 def geometry_of(plan: Plan, motion: bool = True) -> dict[str, Any]:

@@ -14,9 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from flows.loop.problems import Part, flight_of, problem_of
+from flows.loop.problems import Part, flight_of, problem_of, receivers_of
 from flows.steps import Plan
 from pipeline.errors import TsmftisError
+from pipeline.model_update import ModelUpdate
 from pipeline.residual_problem import Parameters
 from stages import closed_loop, navigation
 
@@ -25,8 +26,11 @@ Misses = tuple[list[float], list[float]]
 
 
 def withheld_m(plan: Plan, effects: Parameters) -> Misses | None:
-    """RMS of the smoothed antenna's misses [m] before and after, horizontal and vertical, over the fixes of all flights; None
-    where none could be withheld. `effects` by their scalar names; those of `plan` are in the model already, before and after."""
+    """RMS of the smoothed antenna's misses [m] before and after (then with what is known of the receivers, too), horizontal and
+    vertical, over the fixes of all flights; None where none could be withheld.
+
+    `effects` by their scalar names; those of `plan` are in the model already, before and after.
+    """
     settings = plan.settings.navigation.model_copy(update={"withhold_every_s": WITHHELD_S})
     rest = {n: v for n, v in plan.update.effects.items() if n not in effects}
     plan = replace(
@@ -34,13 +38,16 @@ def withheld_m(plan: Plan, effects: Parameters) -> Misses | None:
         settings=plan.settings.model_copy(update={"navigation": settings}),
         update=replace(plan.update, effects=rest),
     )
-    found = closed_loop.refit(problem_of(plan, Part("navigation")), {n: dict(v) for n, v in effects.items()})
+    problem = problem_of(plan, Part("navigation"))
+    found = closed_loop.refit(problem, {n: dict(v) for n, v in effects.items()}) if effects else {}
+    lag = ModelUpdate(receiver=receivers_of(problem)).velocity_lag
     missed = []
-    for model in ({}, found):
+    for model, late in (({}, False), (found, True)):
         squares, fixes = np.zeros(2), 0
         for flight in plan.opened.keys.flights:
             try:
-                one = navigation.run(**flight_of(plan, flight.id), effects=model).quality["withheld"]
+                given = flight_of(plan, flight.id) | {"velocity_lag": lag(flight.id) if late else 0.0}
+                one = navigation.run(**given, effects=model).quality["withheld"]
             except TsmftisError:  # a flight that the problem leaves out, and says so
                 continue
             if one["fixes"]:

@@ -19,6 +19,7 @@ from stages.navigation.settings import NavigationSettings
 from stages.navigation.solve import Problem, Solution, filled, likelihood, solve
 from stages.navigation.standstill import Standstill, find
 from stages.navigation.velocity import moves
+from stages.navigation.velocity_lag import taken_off
 from tsmftis.camera import Mounting
 from tsmftis.effects import EFFECTS
 from tsmftis.geodesy import radii_of_curvature
@@ -57,6 +58,7 @@ def run(
     initial: tuple[float, Array, Array] | None = None,
     correction: ThermalCorrection | None = None,
     effects: Mapping[str, Mapping[str, float]] | None = None,
+    velocity_lag: float = 0.0,
 ) -> NavigationResult:
     """Integrate one flight.
 
@@ -64,7 +66,12 @@ def run(
     data in the IMU's own axes before they are turned into the body. `effects` are what a model update adds to the declared
     model, by the contract's names ({"gnss_latency": {"latency": 0.04}}). Raises InputError where IMU and GNSS do not overlap,
     where the inertial data have a gap that nothing can bridge, or where the two clocks part.
+    velocity_lag [s]: of the receiver's velocities against its positions, taken off along the path of a run without it.
     """
+    if velocity_lag:
+        gnss = taken_off(
+            gnss, smooth(imu, gnss, model, mounting, settings, initial, correction, effects)[0], velocity_lag
+        )
     solution, passes = smooth(imu, gnss, model, mounting, settings, initial, correction, effects or {})
     histories = quality.histories(solution)
     # What is left needs none of the matrices, which are most of a long flight's memory.

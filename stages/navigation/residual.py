@@ -43,6 +43,7 @@ from stages.navigation.pos import declared, settled_start, smooth
 from stages.navigation.settings import NavigationSettings
 from stages.navigation.solve import Problem, Solution, forward
 from stages.navigation.states import NAVIGATION
+from stages.navigation.velocity_lag import taken_off
 from tsmftis.camera import Mounting
 from tsmftis.effects import EFFECTS
 from tsmftis.geodesy import STANDARD_GRAVITY
@@ -62,6 +63,7 @@ WIDE_ARM, WIDE_LATENCY = 1.0, 0.5  # m, s: the same
 SIGMAS = 5.0  # of the declared scale factor's: a size worth naming
 TOLD, LAG_ROUNDS = 6.0, 4  # sigma of a lag of the velocities that is beyond doubt; rounds in which it is taken off
 VELOCITIES = 3  # components of a fix, before those of its velocity
+VELOCITY_LAG = "velocity_lag_s"
 MINUTE, SHORTEST, GROUPS = 60.0, 15.0, 8  # s, s: what is held out is a minute, or an eighth of a shorter flight
 FEWEST_FIXES = 20
 KEPT = 8  # linearisations in memory
@@ -252,7 +254,7 @@ def residual_problem(
         if abs(more) < TOLD * sigma:
             break
         lag += more
-        moved = replace(gnss, velocity=gnss.velocity + _change(solution, lag))
+        moved = taken_off(gnss, solution, lag)
     chosen = innovations.chosen
     notes: tuple[str, ...] = ()
     if lag != 0.0:
@@ -274,6 +276,7 @@ def residual_problem(
         unit="sigma",
         group_names=names,
         notes=notes,
+        beside={} if lag == 0.0 else {VELOCITY_LAG: float(lag)},
     )
 
 
@@ -283,15 +286,6 @@ def _apart(solution: Solution, order: Sequence[tuple[str, str]], theta: Array) -
     estimated[states.parameter("gnss_latency")] += solution.problem.latency
     places = [states.parameter(e).start + list(EFFECTS[e].units).index(name) for e, name in order]
     return np.asarray((estimated - theta)[places])
-
-
-def _change(solution: Solution, lag: float) -> Array:
-    """Of the unit's velocity (fix, 3) over the lag [s] that ends at each fix."""
-    store, at = solution.store, solution.problem.imu.time
-    n = min(at.size, store.velocity.shape[0], store.epoch.size)
-    time = solution.gathered.measurements.time[solution.gathered.of_fix]
-    v = [[np.interp(t, at[:n], axis) for axis in store.velocity[:n].T] for t in (time, time - lag)]
-    return np.asarray(np.stack(v[0], -1) - np.stack(v[1], -1))
 
 
 def _innovations(solution: Solution, model: ImuModel, settings: NavigationSettings, theta: Array) -> Innovations:

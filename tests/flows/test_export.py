@@ -187,7 +187,9 @@ def test_an_update_is_read_as_it_was_written(tmp_path: Path) -> None:
                 "table": {"covariate": [0, 9.5], "value": [0.0, 1e-7]},
             },
         ),
+        {"F1": {"velocity_lag_s": 0.04}},
     )
+    assert given.velocity_lag("F1") == 0.04 and given.velocity_lag("F2") == 0.0
     write_model_update(given, tmp_path / "update.yaml")
     assert read_model_update(tmp_path / "update.yaml") == given
     write_model_update(ModelUpdate(), tmp_path / "none.yaml")
@@ -225,6 +227,8 @@ def test_an_update_is_read_as_it_was_written(tmp_path: Path) -> None:
             {"learned": [{"stage": "x", "covariate": "y", "unit": "1", "table": {"covariate": [1], "value": []}}]},
             ("learned[0].table", "of one length"),
         ),
+        ({}, {"receiver": {"F1": 0.04}}, ("receiver", "velocity_lag_s")),
+        ({}, {"receiver": {"F1": {"velocity_lag_s": "late"}}}, ("receiver.F1.velocity_lag_s", "'late'", "2 at most")),
         ({}, {"colour": 1}, ("colour", "not known")),
     ],
 )

@@ -21,6 +21,7 @@ from stages.closed_loop import LoopResult, LoopSettings, run
 from stages.closed_loop.signatures import derivatives
 from stages.navigation import NavigationSettings, residual_problem
 from stages.navigation import run as navigate
+from stages.navigation.residual import VELOCITY_LAG
 from tsmftis.camera import Mounting
 from tsmftis.effects import Effects
 from tsmftis.simulator.gnss import observe
@@ -214,6 +215,11 @@ def test_velocities_that_lag_are_no_latency() -> None:
         if not clock:
             told = re.search(r"velocities are ([\d.]+) ± ([\d.]+) ms late", result.notes[0])
             assert told and abs(float(told[1]) - 40.0) < 4.0 * float(told[2])
+            assert p.beside == {VELOCITY_LAG: pytest.approx(0.04, abs=0.002)}
+            late = given
+    model = {"model": MEMS.model, "mounting": Mounting(LEVER), "settings": NavigationSettings(), "initial": initial}
+    nis = [navigate(imu, late, **model, velocity_lag=lag).quality["innovation_nis_mean"] for lag in (0.0, 0.04)]
+    assert nis[1] < 0.6 * nis[0]
 
 
 # --- measured and shared data ----------------------------------------------------------------------------------------
@@ -245,19 +251,23 @@ def test_mems_campaign_has_no_effect() -> None:
 
 @needs("walk")
 def test_walk_has_its_arm_on_the_other_side() -> None:
-    """A real walk: the arm is not the declared 5 cm to the left but 5 cm to the right, and 5 cm higher; innovations fall with it.
-
-    30 cm that are put on top come out on top of that.
+    """A real walk: the arm is not the declared 5 cm to the left but to the right, its length the 5 cm that are known; velocities
+    are late. Innovations fall with both. 30 cm that are put on top come out on top of that.
     """
     given = campaign("walk")
     mounting = given["mounting"]
     less = {**given, "mounting": replace(mounting, imu_to_antenna=mounting.imu_to_antenna - [0.3, 0.0, 0.0])}
-    result = run(residual_problem(**less), QUICK, 1)
+    p = residual_problem(**less)
+    result = run(p, QUICK, 1)
     assert "antenna_lever_arm" in found(result)
     arm = result.values["antenna_lever_arm"]
     assert abs(arm["x"] - 0.3) < 0.02
-    assert abs(arm["y"] - 0.10) < 0.02
-    assert abs(arm["z"] + 0.055) < 0.025
+    assert abs(arm["y"] - 0.09) < 0.02
+    length = np.linalg.norm(mounting.imu_to_antenna + np.array([arm["x"] - 0.3, arm["y"], arm["z"]]))
+    assert 0.03 < length < 0.07
+    assert "ms late against the positions" in result.notes[0]
+    lag = p.beside[VELOCITY_LAG]
     before = navigate(**given).quality["innovation_nis_mean"]
     after = navigate(**less, effects={"antenna_lever_arm": arm}).quality["innovation_nis_mean"]
-    assert after < 0.9 * before
+    timed = navigate(**less, effects={"antenna_lever_arm": arm}, velocity_lag=lag).quality["innovation_nis_mean"]
+    assert after < 0.9 * before and timed < 0.6 * after
