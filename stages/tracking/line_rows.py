@@ -68,7 +68,7 @@ class GeometrySettings(BaseModel):
     sigma_attitude_deg: float = Field(0.01, gt=0, description="of roll, pitch and yaw where the POS states none")
     sigma_position_m: float = Field(0.05, gt=0, description="where the POS states none")
     sigma_velocity_m_per_s: float = Field(0.01, gt=0, description="where the POS states none")
-    least_groups: int = Field(6, ge=2, description="lines are cut into blocks of frames to give as many")
+    least_groups: int = Field(12, ge=2, description="lines are cut into blocks of frames to give as many")
 
 
 @dataclass(frozen=True)
