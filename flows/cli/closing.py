@@ -111,6 +111,9 @@ def print_loop(console: Console, content: dict[str, Any]) -> None:
         console.print(f"    {step['evidence']}", markup=False)
         if step["indistinguishable_from"]:
             console.print(f"    cannot be told from: {', '.join(step['indistinguishable_from'])}", markup=False)
+    for flight, receiver in content["parts"].get("navigation", {}).get("receiver", {}).items():
+        for name, value in receiver.items():
+            console.print(f"+ receiver of {flight}: {name} {value:.4g}", markup=False)
     for name, answer in content["parts"].items():
         if answer["verdict"] == "unexplained":
             console.print(f"? {name}: {'; '.join(answer['notes'])}", markup=False)
