@@ -33,6 +33,7 @@ from dataclasses import dataclass, field, replace
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu, ThermalCorrection
@@ -64,6 +65,8 @@ SIGMAS = 5.0  # of the declared scale factor's: a size worth naming
 TOLD, LAG_ROUNDS = 6.0, 4  # sigma of a lag of the velocities that is beyond doubt; rounds in which it is taken off
 VELOCITIES = 3  # components of a fix, before those of its velocity
 VELOCITY_LAG = "velocity_lag_s"
+BIASES = np.arange(states.GROUPS["gyro_bias"].start, states.GROUPS["accel_bias"].stop)
+BEYOND_DOUBT = 1e-3  # p of biases that are left free
 MINUTE, SHORTEST, GROUPS = 60.0, 15.0, 8  # s, s: what is held out is a minute, or an eighth of a shorter flight
 FEWEST_FIXES = 20
 KEPT = 8  # linearisations in memory
@@ -74,12 +77,14 @@ COMPONENTS = ("north", "east", "down", "north velocity", "east velocity", "down 
 
 @dataclass(frozen=True)
 class Linearisation:
-    """At θ (13,): r (n,), S = −∂r/∂θ (n, 13), and the same for a lag of the velocities alone (n,)."""
+    """At θ (13,): r (n,), S = −∂r/∂θ (n, 13), and the same for a lag of the velocities alone (n,) and for constant biases of
+    gyros and accelerometers (n, 6)."""
 
     theta: Array
     residual: Array
     signatures: Array
     velocity_lag: Array
+    biases: Array
 
     def without_lag(self, residual: Array) -> Array:
         """What a lag of the velocities leaves of a residual (n,) near here."""
@@ -122,10 +127,14 @@ class Innovations:
         theta = self.null.theta.copy()
         for (effect, name), value in zip(self.order, at, strict=True):
             theta[states.parameter(effect).start + list(EFFECTS[effect].units).index(name)] += value
-        problem = replace(self.null, theta=theta, latency=float(theta[states.parameter("gnss_latency")][0]))
+        problem = replace(
+            self.null, theta=theta, declared=theta, latency=float(theta[states.parameter("gnss_latency")][0])
+        )
         gathered, _, count, store = forward(problem, CANDIDATES, self.refused)
         active = states.estimated({*problem.settings.estimate, *CANDIDATES})
-        begun = np.zeros((active.size, len(self.order) + 1))  # the last one: velocities that lag
+        q = len(self.order)
+        begun = np.zeros((active.size, q + 7))  # after the candidates: six biases, velocities that lag
+        begun[np.searchsorted(active, BIASES), q + np.arange(6)] = 1.0
         for column, (effect, name) in enumerate(self.order):
             place = states.GROUPS[effect].start + list(EFFECTS[effect].units).index(name)
             begun[np.searchsorted(active, place), column] = 1.0
@@ -134,21 +143,21 @@ class Innovations:
         weights = np.where(store.used[fixes, None, None], store.S_inv[fixes, :m, :m], np.eye(m))
         if not (np.isfinite(weights).all() and np.isfinite(store.y[fixes]).all()):
             none = np.full(m * fixes.size, np.nan)
-            return Linearisation(at, none, np.full((none.size, at.size), np.nan), none)
+            return Linearisation(at, none, np.full((none.size, q), np.nan), none, np.full((none.size, 6), np.nan))
         root = _roots(weights)
         y = np.einsum("kij,kj->ik", root, store.y[fixes, :m])
 
         def signatures(jolts: Array) -> Array:
-            carried = np.zeros((store.rows.size, 6, len(self.order) + 1))
+            carried = np.zeros((store.rows.size, 6, q + 7))
             late = np.searchsorted(active, states.GROUPS["gnss_latency"].start)
             _carry(count, active, store, begun.copy(), late, self._latency, jolts, carried)
             return np.asarray(np.einsum("kij,kjq->ikq", root, carried[fixes, :m]).reshape(y.size, -1))
 
         s = signatures(np.zeros((store.rows.size, 3)))
-        off, sigma = _beside_all(s, y.ravel(), self._latency)
+        off, sigma = _beside_all(np.delete(s, q + np.arange(6), axis=1), y.ravel(), self._latency)
         if abs(off) + 2.0 * sigma < PHASE:
             s = signatures(_jolts(problem, gathered, count, store))
-        return Linearisation(at, y.ravel(), s[:, :-1], s[:, -1])
+        return Linearisation(at, y.ravel(), s[:, :q], s[:, -1], s[:, q:-1])
 
     @property
     def _latency(self) -> int:
@@ -190,7 +199,8 @@ def _jolts(problem: Problem, gathered: Gathered, count: int, store: kalman.Store
 def _carry(count, active, store, error, late, latency, jolts, out):  # type: ignore[no-untyped-def]
     """H·e⁻ (m, 6, q) at every measurement for errors (n, q) at the start, by the filter's own Φ, H and K; `error` is used up.
 
-    The latency is state `late` and column `latency`; the last column is a lag of the velocities alone, which no state holds.
+    The latency is state `late` and column `latency`; the last column is a lag of the velocities alone, which no state holds, the
+    six before it are biases that stay, where the filter's own die away.
     jolts (m, 3) [m/s²]: what H leaves out of the velocities' derivative by the latency.
     """
     n = active.size
@@ -201,6 +211,7 @@ def _carry(count, active, store, error, late, latency, jolts, out):  # type: ign
             s = active[j] - NAVIGATION
             if s < 6:
                 error[j] *= decay[s]
+                error[j, error.shape[1] - 7 + s] += 1.0 - decay[s]
         error[:NAVIGATION] = moved
         at = store.epoch_measurement[e]
         if at >= 0:
@@ -260,6 +271,10 @@ def residual_problem(
     if lag != 0.0:
         told = f"the velocities are {1e3 * abs(lag):.3g} ± {1e3 * sigma:.2g} ms {'late' if lag > 0.0 else 'early'}"
         notes = (f"{told} against the positions of their fixes, and are taken at those instants here",)
+    own = [first.velocity_lag[:, None]] if count > VELOCITIES else []
+    if correction is not None and _biases_stand_out(innovations.at(_apart(solution, innovations.order, theta))):
+        own.append(first.biases)
+        notes += ("beside every effect, the flight asks for biases beyond those declared: they are left free",)
     time = gnss.time[chosen]
     group, names = _groups(time)
     component = np.repeat(np.arange(count), chosen.size)
@@ -270,7 +285,7 @@ def residual_problem(
         group=np.tile(group, count),
         series=component,
         time=np.tile(time, count),
-        nuisance=first.velocity_lag[:, None] if count > VELOCITIES else np.zeros((component.size, 0)),
+        nuisance=np.hstack([np.zeros((component.size, 0)), *own]),
         channel=component,
         covariates=_covariates(solution, chosen, count, _temperature(imu)),
         unit="sigma",
@@ -278,6 +293,21 @@ def residual_problem(
         notes=notes,
         beside={} if lag == 0.0 else {VELOCITY_LAG: float(lag)},
     )
+
+
+def _biases_stand_out(near: Linearisation) -> bool:
+    """Whether the flight asks for biases that neither their declared sigmas nor any candidate give: what a sensor does with
+    gravity in the chamber, its compensation has taken for a bias there.
+    """
+    rest = np.column_stack([near.signatures, near.velocity_lag])
+    left = []
+    for columns in (rest, np.column_stack([rest, near.biases])):
+        size = np.linalg.norm(columns, axis=0)
+        seen = columns[:, size > 0.0] / size[size > 0.0]
+        beta = np.linalg.lstsq(seen, near.residual, rcond=1e-8)[0]
+        left.append(float(np.sum((near.residual - seen @ beta) ** 2)))
+    gain = (left[0] - left[1]) * (near.residual.size - rest.shape[1] - 6) / max(left[1], 1e-300)
+    return bool(chdtrc(6, max(gain, 0.0)) < BEYOND_DOUBT)
 
 
 def _apart(solution: Solution, order: Sequence[tuple[str, str]], theta: Array) -> Array:

@@ -81,8 +81,14 @@ class Solution:
         return np.asarray(self.smoothed.correction[epochs, : states.NAVIGATION])
 
 
-def initial_covariance(start: Start, model: ImuModel, settings: NavigationSettings, lever: Array) -> Array:
-    """P at the start over all states (28, 28)."""
+def initial_covariance(
+    start: Start, model: ImuModel, settings: NavigationSettings, lever: Array, added: Array | None = None
+) -> Array:
+    """P at the start over all states (28, 28).
+
+    added (19,): parameters that a model update adds. What a sensor's scale factor or g-sensitivity makes of gravity, its
+    calibration at rest has taken for a bias: a bias of that size is as likely as none.
+    """
     variance = np.zeros(states.STATES)
     variance[states.POSITION], variance[states.VELOCITY] = start.sigma_position**2, start.sigma_velocity**2
     g_sensitivity = settings.g_sensitivity_sigma_deg_per_h_per_g * DEG_PER_H / STANDARD_GRAVITY
@@ -96,6 +102,9 @@ def initial_covariance(start: Start, model: ImuModel, settings: NavigationSettin
         "gnss_latency": settings.gnss_latency_sigma_s,
     }.items():
         variance[states.GROUPS[group]] = sigma**2
+    if added is not None:
+        for group, of in (("gyro_bias", "gyro_g_sensitivity"), ("accel_bias", "accel_scale_factor")):
+            variance[states.GROUPS[group]] += (added[states.parameter(of)] * STANDARD_GRAVITY) ** 2
     P = np.diag(variance)
     # Sigmas of roll, pitch, yaw into the NED rotation vector: φ = M·δrpy, the inverse of `rpy_jacobian`.
     to_ned = np.linalg.inv(rpy_jacobian(start.rpy[None])[0])
@@ -211,7 +220,7 @@ def forward(
     theta = problem.theta.copy()
     lever = theta[states.parameter("antenna_lever_arm")]
     theta[states.parameter("gnss_latency")] -= problem.latency
-    P0 = initial_covariance(start, problem.model, settings, lever)
+    P0 = initial_covariance(start, problem.model, settings, lever, problem.theta - problem.declared)
     P0[known], P0[:, known] = 0.0, 0.0
     count = kalman.forward(
         unit,
