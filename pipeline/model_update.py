@@ -29,6 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,10 @@ class ModelUpdate:
 
     def velocity_lag(self, flight: str) -> float:
         """Of the velocities of a flight's receiver against its positions [s]."""
-        return float(self.receiver.get(flight, {}).get(RECEIVER, 0.0))
+        return self.velocity_lags().get(flight, 0.0)
+
+    def velocity_lags(self) -> dict[str, float]:
+        return {flight: float(values[RECEIVER]) for flight, values in self.receiver.items()}
 
 
 def read_model_update(path: Path) -> ModelUpdate:
@@ -107,6 +111,10 @@ def _effects(path: Path, section: str, effects: Any) -> Effects:
     return {name: _effect(path, f"{section}.{name}", name, given) for name, given in effects.items()}
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
 def _receiver(path: Path, given: Any) -> dict[str, dict[str, float]]:
     shape = f"write  receiver: {{F1: {{{RECEIVER}: 0.04}}}}"
     if not isinstance(given, dict) or not all(isinstance(v, dict) and set(v) == {RECEIVER} for v in given.values()):
@@ -115,7 +123,7 @@ def _receiver(path: Path, given: Any) -> dict[str, dict[str, float]]:
     for flight, values in given.items():
         lag = values[RECEIVER]
         place = f"key 'receiver.{flight}.{RECEIVER}'"
-        if isinstance(lag, bool) or not isinstance(lag, int | float) or not abs(lag) <= LARGEST_LAG_S:
+        if not _is_number(lag) or abs(lag) > LARGEST_LAG_S:
             raise InputError(path, place, f"is {lag!r}", f"give seconds, {LARGEST_LAG_S:g} at most either way")
         out[str(flight)] = {RECEIVER: float(lag)}
     return out
@@ -130,13 +138,17 @@ def _learned(path: Path, given: Any) -> tuple[Mapping[str, Any], ...]:
             raise InputError(path, place, "is no learned term", f"it has {', '.join(LEARNED)}")
         table = one["table"]
         columns = list(table.values()) if isinstance(table, dict) else []
-        numbers = all(isinstance(c, list) and all(isinstance(v, int | float) for v in c) for c in columns)
+        numbers = all(isinstance(c, list) and c and all(_is_number(v) for v in c) for c in columns)
         if not numbers or len(columns) < 2 or "covariate" not in table or len({len(c) for c in columns}) != 1:
             raise InputError(
                 path,
                 f"{place[:-1]}.table'",
                 "is no table",
                 "give covariate and its curves, lists of numbers of one length",
+            )
+        if any(b <= a for a, b in pairwise(table["covariate"])):
+            raise InputError(
+                path, f"{place[:-1]}.table.covariate'", "does not increase", "put its values in order, each once"
             )
     return tuple(given)
 

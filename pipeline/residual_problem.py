@@ -127,9 +127,9 @@ class ResidualProblem:
 
     def __post_init__(self) -> None:
         n = self.group.size
-        for name in ("series", "time", "nuisance", "channel"):
+        for name in ("series", "time", "nuisance", "channel", "sigma"):
             value = getattr(self, name)
-            if value is not None and len(value) != n:
+            if value is not None and np.ndim(value) and len(value) != n:
                 raise ValueError(f"{self.stage}: {name} has {len(value)} samples, group has {n}")
         for name, covariate in self.covariates.items():
             shape = covariate.values.shape if isinstance(covariate, Basis) else covariate.shape
@@ -155,6 +155,8 @@ def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
     first = parts[0]
     if len(parts) == 1:
         return first
+    if any(np.ndim(0.0 if part.sigma is None else part.sigma) for part in parts):
+        raise ValueError(f"{first.stage}: sigmas of single samples cannot be joined")
     own: dict[str, list[Labels]] = {"group": [], "series": [], "channel": []}
     names: dict[int, str] = {}
     for name, part in problems.items():

@@ -151,12 +151,17 @@ def _process(plan: Plan, opened: Campaign, warnings: list[str], dask: str | None
 
 def told(update: ModelUpdate) -> list[str]:
     """What a model update does, and what of it is on record only."""
+    from stages import tracking
+
     said = []
     if update.effects:
         said.append(f"model update: {', '.join(update.effects)}")
     said += [f"model update of bench {i}: {', '.join(effects) or 'none'}" for i, effects in update.bench.items()]
+    said += [f"model update of the receiver of {f}: velocities {v:g} s late" for f, v in update.velocity_lags().items()]
+    used = tracking.applied(update.learned)
     said += [
-        f"model update: learned:{one['covariate']} of the stage {one['stage']} is on record, and applied by no model"
+        f"model update: learned:{one['covariate']} of the stage {one['stage']} "
+        + ("turns the camera" if one in used else "is on record, and applied by no model")
         for one in update.learned
     ]
     return said

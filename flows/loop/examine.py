@@ -65,7 +65,7 @@ def examine_step(root: Path, plan: Plan, part: Part, seed: int) -> StageRecord:
         root,
         "loop",
         part.name,
-        ("stages.closed_loop", "flows.loop.problems"),
+        ("stages.closed_loop", "flows.loop.problems", "flows.loop.withheld"),
         {
             **settings_of(plan, part),
             "closed_loop": plain(plan.settings.closed_loop),
@@ -102,6 +102,8 @@ def _held_against_fixes(
             other = withheld_m(plan, rest)
             if other is not None:
                 without[effect] = other[1]
+        if not without:
+            break
         effect = min(without, key=lambda name: size(without[name]))
         if size(missed[1]) <= (1.0 + WORSE) * size(without[effect]):
             break

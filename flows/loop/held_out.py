@@ -98,6 +98,7 @@ def held_out_step(root: Path, before: Plan, last: Plan, answers: Answers, runs: 
         {
             "figures": plain([first, second]),
             "effects": plain({name: answers[name]["effects"] for name in sorted(added)}),
+            "withheld": plain(answers.get("navigation", {}).get("withheld_m")),
             "without": plain(answers["spectral"]["without"] if "spectral" in added else []),
             "settings": {name: settings_of(last, Part(name)) for name in sorted(added)},
         },

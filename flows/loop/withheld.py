@@ -27,18 +27,16 @@ Misses = tuple[list[float], list[float]]
 
 def withheld_m(plan: Plan, effects: Parameters) -> Misses | None:
     """RMS of the smoothed antenna's misses [m] before and after (then with what is known of the receivers, too), horizontal and
-    vertical, over the fixes of all flights; None where none could be withheld.
+    vertical, over the fixes of all flights; None where none could be withheld, or too few are left for the effects.
 
-    `effects` by their scalar names; those of `plan` are in the model already, before and after.
+    `effects` by their scalar names, none of them in the update of `plan`.
     """
     settings = plan.settings.navigation.model_copy(update={"withhold_every_s": WITHHELD_S})
-    rest = {n: v for n, v in plan.update.effects.items() if n not in effects}
-    plan = replace(
-        plan,
-        settings=plan.settings.model_copy(update={"navigation": settings}),
-        update=replace(plan.update, effects=rest),
-    )
-    problem = problem_of(plan, Part("navigation"))
+    plan = replace(plan, settings=plan.settings.model_copy(update={"navigation": settings}))
+    try:
+        problem = problem_of(plan, Part("navigation"))
+    except TsmftisError:
+        return None
     found = closed_loop.refit(problem, {n: dict(v) for n, v in effects.items()}) if effects else {}
     lag = ModelUpdate(receiver=receivers_of(problem)).velocity_lag
     missed = []

@@ -66,6 +66,7 @@ def write_loop_page(content: dict[str, Any], out: Path) -> Path:
         figures=[(label, content["before"][k], content["after"][k]) for k, label in FIGURES if k in content["before"]],
         held_out=[(label, k) for k, label in FIGURES if k in content["held_out"]],
         shown=shown,
+        applied=[s["effect"].removeprefix("learned:") for s in content["steps"] if s.get("applied")],
         targets=draw.html(targets(*runs)) if runs[0].get("rqe") and places["before"] != places["after"] else None,
     )
 

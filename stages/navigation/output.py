@@ -44,17 +44,30 @@ def trajectory(solution: Solution, doubts: Doubts, least_heading_sigma: float = 
     return out
 
 
-def _block(s: Solution, sigmas_at: Array, theta: Array, block: slice) -> tuple[Array, ...]:
-    """The trajectory's arrays, in its order after time, for some of the stamps."""
-    imu, store, correction = s.problem.imu, s.store, s.smoothed.correction
-    epoch, time = store.epoch[block], imu.time[block]
+def _shift(s: Solution, block: slice) -> tuple[NDArray[np.int64], NDArray[np.int64], Array, Array]:
+    """Epochs before and after each stamp, how far it is between them (n, 1), and smoothed minus filtered navigation (n, 9).
+
+    Between two epochs the correction runs from the one after the first to the one before the second's update.
+    """
+    store, correction, nav = s.store, s.smoothed.correction, slice(0, states.NAVIGATION)
+    epoch, time = store.epoch[block], s.problem.imu.time[block]
     following = np.minimum(epoch + 1, s.count - 1)
     span = store.epoch_time[following] - store.epoch_time[epoch]
     part = np.divide(time - store.epoch_time[epoch], span, out=np.zeros(time.size), where=span > 0)[:, None]
-    # Between two epochs the correction runs from the one after the first to the one before the second's update.
-    nav = slice(0, states.NAVIGATION)
     arriving = correction[following, nav] + store.epoch_dx[following, nav] * (following > epoch)[:, None]
-    shift = (1.0 - part) * correction[epoch, nav] + part * arriving
+    return epoch, following, part, (1.0 - part) * correction[epoch, nav] + part * arriving
+
+
+def smoothed_velocity(s: Solution) -> Array:
+    """Smoothed, at every inertial sample (n, 3)."""
+    whole = slice(0, s.store.epoch.size)
+    return np.asarray(s.store.velocity[whole] + _shift(s, whole)[3][:, states.VELOCITY])
+
+
+def _block(s: Solution, sigmas_at: Array, theta: Array, block: slice) -> tuple[Array, ...]:
+    """The trajectory's arrays, in its order after time, for some of the stamps."""
+    imu, store = s.problem.imu, s.store
+    epoch, following, part, shift = _shift(s, block)
     latitude, longitude, height = store.position[block].T
     north, east = radii_of_curvature(latitude)
     rpy = np.stack(dcm_to_rpy(exp_so3(shift[:, states.ATTITUDE]) @ quaternion_to_dcm(store.q[block])), 1)

@@ -64,7 +64,7 @@ WIDE_ARM, WIDE_LATENCY = 1.0, 0.5  # m, s: the same
 SIGMAS = 5.0  # of the declared scale factor's: a size worth naming
 TOLD, LAG_ROUNDS = 6.0, 4  # sigma of a lag of the velocities that is beyond doubt; rounds in which it is taken off
 VELOCITIES = 3  # components of a fix, before those of its velocity
-VELOCITY_LAG = "velocity_lag_s"
+VELOCITY_LAG, LARGEST_LAG = "velocity_lag_s", 1.0  # s: more is no filter's
 BIASES = np.arange(states.GROUPS["gyro_bias"].start, states.GROUPS["accel_bias"].stop)
 BEYOND_DOUBT = 1e-3  # p of biases that are left free
 MINUTE, SHORTEST, GROUPS = 60.0, 15.0, 8  # s, s: what is held out is a minute, or an eighth of a shorter flight
@@ -72,7 +72,6 @@ FEWEST_FIXES = 20
 KEPT = 8  # linearisations in memory
 EXACT = 1e-6  # relative, of a step
 PHASE = 5e-3  # s: within it a vibration of 25 Hz is a linear matter
-COMPONENTS = ("north", "east", "down", "north velocity", "east velocity", "down velocity")
 
 
 @dataclass(frozen=True)
@@ -251,7 +250,7 @@ def residual_problem(
     Raises InputError as `run` does, and where too few fixes are left.
     """
     effects, moved, lag, sigma = effects or {}, gnss, 0.0, float("inf")
-    for _ in range(LAG_ROUNDS):
+    for again in range(LAG_ROUNDS):
         solution = _widely_estimated(imu, moved, model, mounting, settings, initial, correction, effects)
         theta = declared(mounting, effects)
         innovations = _innovations(solution, model, settings, theta)
@@ -262,7 +261,7 @@ def residual_problem(
         near = innovations.at(_apart(solution, innovations.order, theta))
         signatures = np.column_stack([near.signatures, near.velocity_lag])
         more, sigma = _beside_all(signatures, near.residual, signatures.shape[1] - 1)
-        if abs(more) < TOLD * sigma:
+        if abs(more) < TOLD * sigma or again == LAG_ROUNDS - 1 or abs(lag + more) > LARGEST_LAG:
             break
         lag += more
         moved = taken_off(gnss, solution, lag)

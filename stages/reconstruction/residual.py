@@ -38,7 +38,6 @@ from tsmftis.effects import EFFECTS
 from tsmftis.interferometer import Interferometer
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 FEWEST_COLUMNS = 48  # of an interferogram that says something
 REMEMBERED = 1024  # residuals

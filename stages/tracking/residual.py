@@ -359,18 +359,18 @@ def geometry_residual_px(
     known = {name: dict(found[name]) for name in found if name in EFFECTS and EFFECTS[name].stage == "geometry"}
     if not known and not learned:
         return before, before
-    steps, bases = made.steps(list(known)), [made.covariates()[name] for name in learned]
+    covariates = made.covariates() if learned else {}
+    steps, bases = made.steps(list(known)), [covariates[name] for name in learned]
     r = made.residual(known)
     s = made.signatures(known, steps) if steps else np.zeros((r.size, 0))
     length = np.linalg.norm(s, axis=0)
     length[length == 0.0] = 1.0
     columns = np.column_stack([s / length, *(b.columns for b in bases)])
-    ridge = _ridge(columns, len(steps), r)
     group, squares = made.group[made.order], []
     of_pick = np.concatenate([made.group[(made.line == i) & (made.channel == 0)] for i in range(len(made.lines))])
     for one in np.unique(of_pick):
         train = group != one
-        beta = _ridged(columns[train], ridge, r[train])
+        beta = _ridged(columns[train], _ridge(columns[train], len(steps), r[train]), r[train])
         values: Parameters = known
         for (effect, key, _), value in zip(steps, beta[: len(steps)] / length, strict=True):
             values = _moved(values, effect, key, float(value))

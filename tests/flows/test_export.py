@@ -227,6 +227,29 @@ def test_an_update_is_read_as_it_was_written(tmp_path: Path) -> None:
             {"learned": [{"stage": "x", "covariate": "y", "unit": "1", "table": {"covariate": [1], "value": []}}]},
             ("learned[0].table", "of one length"),
         ),
+        (
+            {},
+            {
+                "learned": [
+                    {"stage": "x", "covariate": "y", "unit": "1", "table": {"covariate": [1, 1], "value": [0, 1]}}
+                ]
+            },
+            ("learned[0].table.covariate", "does not increase"),
+        ),
+        (
+            {},
+            {
+                "learned": [
+                    {
+                        "stage": "x",
+                        "covariate": "y",
+                        "unit": "1",
+                        "table": {"covariate": [1.0, float("nan")], "value": [0, 1]},
+                    }
+                ]
+            },
+            ("learned[0].table", "lists of numbers"),
+        ),
         ({}, {"receiver": {"F1": 0.04}}, ("receiver", "velocity_lag_s")),
         ({}, {"receiver": {"F1": {"velocity_lag_s": "late"}}}, ("receiver.F1.velocity_lag_s", "'late'", "2 at most")),
         ({}, {"colour": 1}, ("colour", "not known")),
