@@ -20,7 +20,7 @@ from stages.thermal.smooth import Curve, Kernel, Smooth
 from stages.thermal.targets import CHANNELS
 from tsmftis.inertial import DEG_PER_H
 
-SHARED = Path(os.environ.get("TSMFTIS_SHARED", "/nowhere")) / "campaigns"
+SHARED = Path(os.environ.get("TSMFTIS_SHARED", Path(__file__).parents[2].parent / "shared")) / "campaigns"
 LOG = SHARED.parent / "data" / "imu_thermal" / "tofupilot_imu_raw_data.csv"
 
 
@@ -44,7 +44,7 @@ def chamber(seed: int, play: float = 0.0, cycles: float = 1.5, hours: float = 2.
 def campaign(name: str) -> ResidualProblem:
     folder = SHARED / name / "chamber"
     if not folder.is_dir():
-        pytest.skip(f"TSMFTIS_SHARED has no campaign {name}")
+        pytest.skip(f"the campaign {name} is not in {SHARED}")
     train, verify = (Chamber.from_file(folder / f"{n}.nc", n) for n in ("train", "verify"))
     return residual_problem([train], [verify], ThermalSettings())
 
