@@ -3,6 +3,7 @@
 Functions
 ---------
 curves_of    the curves, with knots on quantiles of some values
+even         with knots at even distances
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ Array = NDArray[np.float64]
 
 KNOTS = 6
 TABLE = 25
+EVENLY = 1001
 CONSTANT = 1e-9  # relative spread below which a covariate does not vary
 
 
@@ -65,3 +67,8 @@ def curves_of(values: Array, distance: bool = False) -> Curves | None:
         return made
     flat = np.column_stack([np.full(values.size, float(not distance)), (values - made.centre) / spread])
     return replace(made, line=np.asarray(np.linalg.lstsq(flat, made.bends(values), rcond=None)[0], float))
+
+
+def even(low: float, high: float) -> Curves | None:
+    """Curves between two values with knots at even distances; None where they are one value."""
+    return curves_of(np.linspace(low, high, EVENLY))

@@ -88,6 +88,16 @@ class Basis:
     unit: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
 
+    @classmethod
+    def scaled(cls, columns: Array, values: Array, at: Array, curves: Array, named: tuple[str, str, str]) -> Basis:
+        """One scale for all columns: what the data say little of is then held small as a curve, not as a signal.
+
+        named: unit of the covariate, what is a curve of it, and its unit.
+        """
+        unit, name, of = named
+        scale = float(np.sqrt(np.mean(columns**2)))
+        return cls(columns / scale, values, at, {name: curves / scale}, unit, {name: of})
+
 
 @dataclass(frozen=True)
 class ResidualProblem:

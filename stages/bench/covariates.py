@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.curves import Curves, curves_of
+from pipeline.curves import Curves, even
 from pipeline.records import Bench
 from pipeline.residual_problem import Basis
 from stages.bench.bench import BenchSettings, choose, corrected, find_zpd
@@ -24,7 +24,6 @@ from tsmftis import fourier
 
 Array = NDArray[np.float64]
 
-EVENLY = 1001  # values for knots at even distances
 PATH_STEP = 1e-9  # m
 SIGNAL_STEP = 1e-4  # relative
 
@@ -48,28 +47,32 @@ def covariates_of(
     of_path, of_level = _through(path, x), _bent(level, signal)
     nowhere = np.full(seen.size, np.nan)  # a wavenumber has no path difference, and no signal, of its own
     return {
-        "path by OPD": _basis(
+        "path by OPD": Basis.scaled(
             _taken_out(lambda b: made(scans, bench.opd + b), PATH_STEP, of_path),
             nowhere,
-            (path.table, _through(path, path.table)),
+            path.table,
+            _through(path, path.table),
             ("m", "path", "m"),
         ),
-        "contrast by OPD": _basis(
+        "contrast by OPD": Basis.scaled(
             _taken_out(lambda b: made(scans * (1.0 - b), bench.opd), SIGNAL_STEP, of_path),
             nowhere,
-            (path.table, _through(path, path.table)),
+            path.table,
+            _through(path, path.table),
             ("m", "contrast", "1"),
         ),
-        "signal level": _basis(
+        "signal level": Basis.scaled(
             _taken_out(lambda b: made(scans - largest * b, bench.opd), SIGNAL_STEP, of_level),
             nowhere,
-            (level.table, _bent(level, level.table)),
+            level.table,
+            _bent(level, level.table),
             ("1", "signal", "1"),
         ),
-        "wavenumber": _basis(
+        "wavenumber": Basis.scaled(
             unit * reference[:, None] * colour(seen),
             seen,
-            (colour.table, colour(colour.table)),
+            colour.table,
+            colour(colour.table),
             ("m-1", "response", "1"),
         ),
     }
@@ -82,7 +85,7 @@ def _taken_out(made: Callable[[Array], Array], step: float, curves: Array) -> Ar
 
 
 def _even(low: float, high: float) -> Curves:
-    curves = curves_of(np.linspace(low, high, EVENLY))
+    curves = even(low, high)
     assert curves is not None  # there is a burst, and light at many wavenumbers
     return curves
 
@@ -95,10 +98,3 @@ def _through(curves: Curves, x: Array) -> Array:
 def _bent(curves: Curves, signal: Array) -> Array:
     """Splines of the signal (…) without their straight line (…, m), zero at zero."""
     return _through(curves, signal.ravel())[:, 1:].reshape(*signal.shape, -1)
-
-
-def _basis(columns: Array, values: Array, table: tuple[Array, Array], named: tuple[str, str, str]) -> Basis:
-    """One scale for all columns; table: the covariate and the curves there; named: its unit, what is a curve of it, its unit."""
-    (unit, name, of), (at, curves) = named, table
-    scale = float(np.sqrt(np.mean(columns**2)))
-    return Basis(columns / scale, values, at, {name: curves / scale}, unit, {name: of})

@@ -321,7 +321,8 @@ def _narrow(problem: ResidualProblem, state: State, found: Sequence[Member], mem
     if out and len(out) < len(member.names):
         grid = state.narrowed.setdefault(member.effect, [])
         alike = [m.point for m in found if m.effect == member.effect and m.names == member.names]
-        grid += [{**point, **dict.fromkeys(out, 0.0)} for point in alike]
+        narrower = [{**point, **dict.fromkeys(out, 0.0)} for point in alike]
+        grid += [point for point in narrower if point not in grid]
 
 
 def _channel(problem: ResidualProblem, covariate: str) -> int | None:

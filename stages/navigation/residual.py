@@ -255,10 +255,10 @@ def residual_problem(
         theta = declared(mounting, effects)
         innovations = _innovations(solution, model, settings, theta)
         first = innovations.at(np.zeros(len(innovations.order)))
-        count = first.residual.size // innovations.chosen.size
-        if count == VELOCITIES or gnss.velocity is None:
-            break
         near = innovations.at(_apart(solution, innovations.order, theta))
+        count = first.residual.size // innovations.chosen.size
+        if count == VELOCITIES:
+            break
         signatures = np.column_stack([near.signatures, near.velocity_lag])
         more, sigma = _beside_all(signatures, near.residual, signatures.shape[1] - 1)
         if abs(more) < TOLD * sigma or again == LAG_ROUNDS - 1 or abs(lag + more) > LARGEST_LAG:
@@ -271,7 +271,7 @@ def residual_problem(
         told = f"the velocities are {1e3 * abs(lag):.3g} ± {1e3 * sigma:.2g} ms {'late' if lag > 0.0 else 'early'}"
         notes = (f"{told} against the positions of their fixes, and are taken at those instants here",)
     own = [first.velocity_lag[:, None]] if count > VELOCITIES else []
-    if correction is not None and _biases_stand_out(innovations.at(_apart(solution, innovations.order, theta))):
+    if correction is not None and _biases_stand_out(near):
         own.append(first.biases)
         notes += ("beside every effect, the flight asks for biases beyond those declared: they are left free",)
     time = gnss.time[chosen]
@@ -428,15 +428,6 @@ def _temperature(imu: Imu) -> tuple[Array, Array] | None:
     return (t.time, np.nanmean(np.hstack(read), axis=1)) if read else None
 
 
-def _acceleration(solution: Solution, chosen: NDArray[np.int64]) -> Array:
-    """Of the unit at these fixes (k, 3), north, east, down [m/s²]."""
-    store, fixes = solution.store, solution.gathered.of_fix[chosen]
-    time = solution.gathered.measurements.time[fixes]
-    k = np.searchsorted(solution.problem.imu.time, time).clip(0, store.epoch.size - 1)
-    force = solution.gathered.measurements.force[fixes]
-    return np.einsum("kij,kj->ki", quaternion_to_dcm(store.q[k]), force) + np.array([0.0, 0.0, STANDARD_GRAVITY])
-
-
 def _covariates(
     solution: Solution, chosen: NDArray[np.int64], count: int, temperature: tuple[Array, Array] | None
 ) -> dict[str, Array]:
@@ -449,7 +440,7 @@ def _covariates(
     roll, pitch, yaw = dcm_to_rpy(dcm)
     rate, force = solution.gathered.measurements.rate[fixes], solution.gathered.measurements.force[fixes]
     turning = np.einsum("kij,kj->ki", dcm, rate)
-    acceleration = _acceleration(solution, chosen)
+    acceleration = np.einsum("kij,kj->ki", dcm, force) + np.array([0.0, 0.0, STANDARD_GRAVITY])
     common = {
         "time": time,
         "speed": np.hypot(velocity[:, 0], velocity[:, 1]),

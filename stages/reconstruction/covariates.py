@@ -14,13 +14,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.curves import TABLE, Curves, curves_of
+from pipeline.curves import EVENLY, TABLE, curves_of, even
 from pipeline.residual_problem import Basis
 from stages.reconstruction.panel_model import Model
 
 Array = NDArray[np.float64]
-
-EVENLY = 1001  # values for knots at even distances
 
 
 def covariates_of(model: Model) -> dict[str, Basis]:
@@ -48,12 +46,14 @@ def _along(
     x: Array, shown: Array, origin: float | None, named: tuple[str, str, str], values: Array | None = None
 ) -> Basis | None:
     """Curves of x (n,), zero at `origin`, each times `shown` (n,); named: unit of x, what is a curve of it, and its unit."""
-    curves = _even(x)
+    curves = even(float(x.min()), float(x.max()))
     if curves is None:
         return None
     at = curves.table
     zero = 0.0 if origin is None else curves(np.array([origin]))
-    return _basis((curves(x) - zero) * shown[:, None], x if values is None else values, at, curves(at) - zero, named)
+    return Basis.scaled(
+        (curves(x) - zero) * shown[:, None], x if values is None else values, at, curves(at) - zero, named
+    )
 
 
 def _response(model: Model, gain: Array) -> Basis | None:
@@ -71,15 +71,4 @@ def _response(model: Model, gain: Array) -> Basis | None:
 
     at = np.linspace(lit[0], lit[-1], TABLE)
     columns = gain[:, None] * model.fringes_of(of(wavenumber))
-    return _basis(columns, np.full(gain.size, np.nan), at, of(at), ("m-1", "response", "1"))
-
-
-def _even(x: Array) -> Curves | None:
-    return curves_of(np.linspace(x.min(), x.max(), EVENLY)) if np.ptp(x) > 0.0 else None
-
-
-def _basis(columns: Array, values: Array, at: Array, curves: Array, named: tuple[str, str, str]) -> Basis:
-    """One scale for all columns: what the data say little of is then held small as a curve, not as a signal."""
-    unit, name, of = named
-    scale = float(np.sqrt(np.mean(columns**2)))
-    return Basis(columns / scale, values, at, {name: curves / scale}, unit, {name: of})
+    return Basis.scaled(columns, np.full(gain.size, np.nan), at, of(at), ("m-1", "response", "1"))

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from pipeline.curves import Curves, curves_of
 from pipeline.residual_problem import Basis, Candidate, Parameter, Parameters, ResidualProblem
 from stages.tracking.curves import COVARIATES, UNITS, Place
+from stages.tracking.learned import AXES
 from stages.tracking.line_rows import SERIES, Geometry, GeometrySettings, Line, LineRows, Rows, Terrain, chosen
 from stages.tracking.pos_errors import whitener
 from tsmftis.camera import Camera, Mounting
@@ -127,7 +128,7 @@ class _Campaign:
             begun += own.size
             value = np.empty(self.count)
             value[self.order] = basis.values
-            for axis, name in enumerate(("row_px", "column_px")):
+            for axis, name in enumerate(AXES):
                 out[:, axis] += np.interp(value[self.channel == axis], basis.at, basis.curves[name] @ own)
         return out
 
@@ -226,7 +227,7 @@ class _Campaign:
             wide = [np.zeros((at.size, 2 * k)) for _ in (0, 1)]
             for axis in (0, 1):
                 wide[axis][:, axis * k : (axis + 1) * k] = known[axis](at)
-            table = {axis: w / scale for axis, w in zip(("row_px", "column_px"), wide, strict=True)}
+            table = {axis: w / scale for axis, w in zip(AXES, wide, strict=True)}
         return Basis(columns / scale, values[self.order], at, table, UNITS[name], dict.fromkeys(table, "px"))
 
     def signatures(self, at: Parameters, of: Sequence[tuple[str, str, float]], whitened: bool = True) -> Array:
