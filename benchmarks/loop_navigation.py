@@ -4,8 +4,8 @@
 
 Flights of two minutes and a half with turns to both sides in gusts, fixes every half second, two grades of unit. An effect acts
 on one axis, at multiples of its sigma with everything else estimated (Cramér–Rao; of a scale factor it holds the declared
-scatter). Printed: false alarms on clean flights with the one-sided 95 % bound, detection, whom an effect was taken for, errors
-in sigma, and what is answered when the effect is not in the library.
+scatter), not beyond what it can physically be. Printed: false alarms on clean flights with the one-sided 95 % bound, detection,
+whom an effect was taken for, errors in sigma, and what is answered when the effect is not in the library.
 """
 
 from __future__ import annotations
@@ -97,11 +97,13 @@ def sigmas(grade: Grade, path: int) -> dict[tuple[str, str], float]:
 
 
 def one_axis(grade: Grade, path: int, effect: str, trial: int, size: float) -> dict[str, dict[str, float]]:
-    """The effect on one of its axes, positive or negative in turn, `size` sigma large."""
-    axes = list(EFFECTS[effect].units)
+    """The effect on one of its axes, positive or negative in turn, `size` sigma large; axes on which that is more than the effect
+    can physically be are left out."""
+    limits, sigma = EFFECTS[effect].largest, sigmas(grade, path)
+    axes = [axis for axis in limits if max(SIZES) * sigma[effect, axis] < limits[axis]]
     axis = axes[trial % len(axes)]
     sign = 1.0 if (trial // len(axes)) % 2 == 0 else -1.0
-    return {effect: {axis: sign * size * sigmas(grade, path)[effect, axis]}}
+    return {effect: {axis: sign * size * sigma[effect, axis]}}
 
 
 def told(result: LoopResult, effect: str) -> bool:
@@ -166,7 +168,7 @@ def main() -> None:
     for grade in (RLG, MEMS):
         for effect in NAMES:
             answers: Counter[str] = Counter()
-            for i in range(max(a.trials // 4, 3)):
+            for i in range(max(a.trials // 2, 3)):
                 path = i % PATHS
                 p = problem(grade, path, base + 3000 + i, one_axis(grade, path, effect, i, WITHOUT))
                 p = replace(p, candidates=tuple(c for c in p.candidates if c.effect != effect))

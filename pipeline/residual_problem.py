@@ -16,7 +16,7 @@ joined           several problems of one instrument as one
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -78,7 +78,8 @@ class Basis:
 
     columns (n, k): curves of the covariate as they show in the samples, the straight line first, none constant in the
     covariate; values (n,): the covariate at each sample, NaN where it has none; at (m,) and curves, name → (m, k): what the
-    columns stand for, for a table; unit of the covariate, units of the curves by their names.
+    columns stand for, for a table; unit of the covariate, units of the curves by their names; common: a coefficient means
+    the same in every problem that has the covariate.
     """
 
     columns: Array
@@ -87,6 +88,7 @@ class Basis:
     curves: Mapping[str, Array]
     unit: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
+    common: bool = False
 
     @classmethod
     def scaled(cls, columns: Array, values: Array, at: Array, curves: Array, named: tuple[str, str, str]) -> Basis:
@@ -159,7 +161,7 @@ def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
     """Problems of one instrument under one set of parameters, by name (a flight's), one after the other.
 
     Groups, series, channels, notes and nuisance are each problem's own; candidates, sigma and floor those of the first;
-    covariates those that all have, but for bases. A single problem stays as it is.
+    covariates those that all have, of bases the common ones. A single problem stays as it is.
     """
     parts = list(problems.values())
     first = parts[0]
@@ -177,8 +179,8 @@ def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
             own[kind].append(new + start)
         for old, new_label in zip(part.group.tolist(), own["group"][-1].tolist(), strict=True):
             names[new_label] = f"{name} {part.group_names.get(old, old)}"
-    plain = [{k: v for k, v in part.covariates.items() if not isinstance(v, Basis)} for part in parts]
-    shared = [k for k in plain[0] if all(k in one for one in plain)]
+    shared = [k for k in first.covariates if all(k in part.covariates for part in parts)]
+    covariates = {k: _stacked([part.covariates[k] for part in parts]) for k in shared}
     return replace(
         first,
         residual=lambda parameters: np.concatenate([part.residual(parameters) for part in parts]),
@@ -187,7 +189,21 @@ def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
         channel=np.concatenate(own["channel"]),
         time=np.concatenate([part.time for part in parts]),
         nuisance=block_diag(*(part.nuisance for part in parts)),
-        covariates={k: np.concatenate([one[k] for one in plain]) for k in shared},
+        covariates={k: v for k, v in covariates.items() if v is not None},
         group_names=names,
         notes=tuple(f"{name}: {note}" for name, part in problems.items() for note in part.notes),
+    )
+
+
+def _stacked(parts: Sequence[Array | Basis]) -> Array | Basis | None:
+    """One covariate of several problems; None where its coefficients are each problem's own."""
+    plain = [part for part in parts if not isinstance(part, Basis)]
+    bases = [part for part in parts if isinstance(part, Basis)]
+    if not bases:
+        return np.concatenate(plain)
+    if plain or not all(b.common and b.columns.shape[1] == bases[0].columns.shape[1] for b in bases):
+        return None
+    widest = max(bases, key=lambda b: float(np.ptp(b.at)))
+    return replace(
+        widest, columns=np.vstack([b.columns for b in bases]), values=np.concatenate([b.values for b in bases])
     )

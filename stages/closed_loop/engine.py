@@ -599,8 +599,17 @@ def _try_learned(
     rows, columns, data = layout.rows, state.columns, state.residual
     p = columns.shape[1]
     names = list(splines)
+    drifts = [k for k, n in enumerate(names) if _is_time(problem, n)]
     finding, state.noise = search(
-        layout, columns[rows], [splines[n][rows] for n in names], data[rows], state.noise, settings.draws, rng
+        layout,
+        columns[rows],
+        [splines[n][rows] for n in names],
+        data[rows],
+        state.noise,
+        settings.draws,
+        rng,
+        None,
+        drifts,
     )
     if finding is None or finding.p > settings.learned_p_value:
         return False
@@ -650,6 +659,13 @@ def _try_learned(
     if finding.p < CERTAIN and _repeats(checked) and confirmation.controls_fail(reached, valid):
         state.certain.append(f"learned:{name}")
     return name
+
+
+def _is_time(problem: ResidualProblem, covariate: str) -> bool:
+    values = problem.covariates[covariate]
+    values = values.values if isinstance(values, Basis) else values
+    known = np.isfinite(values)
+    return bool(known.any() and np.array_equal(values[known], problem.time[known]))
 
 
 def _table(covariate: Array | Basis, term: Array, beta: Array) -> dict[str, list[float]]:

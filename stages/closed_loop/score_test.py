@@ -6,14 +6,23 @@ Of the Gram matrix M = C'K⁻¹C of C = [N | S₁ | S₂ | … | r], with N proj
 
 K is fitted by REML with the member in the model: an effect that is there must not count as noise. The p-value of a member is
 the mean of P(χ²_q > χ²_k(K_m)) over noise K_m drawn from its restricted likelihood, which is the F-test where the noise is
-white. An effect that makes n tests (a grid) pays for them itself: its p-values count n times, so that effects of one test do not
-lose power to it; so do its kinds of hypothesis (one number for several sensors, one sensor, several): n tests of one of m kinds
-count m·n times. Family-wise: the share of draws u ~ N(0, S'K⁻¹S) in which the smallest p of the library, so counted, is below
+white; or that of the likelihood ratio, if it is larger:
+
+    Λ_k = min_K D(r; K) − min_{K, β} D(r − S_k·β; K) ~ χ²_q,      D = −2·l restricted by N alone
+
+A slow signature takes from r what tells that the noise is slow, so that the noise left beside it seems whiter than it is; the
+ratio lets each side have the noise that suits it. A curve of time is what coloured noise looks like, and is judged in the noise
+without it.
+
+An effect that makes n tests (a grid) pays for them itself: its p-values count n times, so that effects of one test do not lose
+power to it; so do its kinds of hypothesis (one number for several sensors, one sensor, several): n tests of one of m kinds count
+m·n times. Family-wise: the share of draws u ~ N(0, S'K⁻¹S) in which the smallest p of the library, so counted, is below
 it, or the number of effects times it (Bonferroni's bound), whichever is smaller.
 
 Functions
 ---------
 search        the best member with its family-wise p-value
+likelihood_ratio   Λ of one member
 project       a Gram matrix with columns projected off
 statistic     χ² and rank of some columns
 solve         their coefficients and covariance
@@ -22,20 +31,21 @@ log_counts    how many tests each member stands for
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, gammaincc, gammaln, log_ndtr, logsumexp
 
-from stages.closed_loop.noise import Layout, Noise, fit_noise, gram, noise_draws
+from stages.closed_loop.noise import Layout, Noise, deviance, fit_noise, gram, noise_draws
 
 Array = NDArray[np.float64]
 
 RCOND = 1e-9  # of a Gram matrix with unit diagonal
 NOISE_DRAWS = 48
 LOOKED_AT = 3  # members whose own noise is fitted, of each of two first looks
+RATIO_ROUNDS = 2  # of coefficients and noise in turn
 NOWHERE_NEAR = 0.3  # family-wise p at both first looks, beyond which there is no closer look
 
 
@@ -107,9 +117,11 @@ def search(
     draws: int,
     rng: np.random.Generator,
     log_tests: Array | None = None,
+    drifts: Collection[int] = (),
 ) -> tuple[Finding | None, Noise]:
     """The most significant of `signatures` [(rows, q), …] in `residual` (rows,) beside `nuisance` (rows, p), and the noise
-    without any of them; no finding where no signature is left beside the nuisance. `log_tests`: of `log_counts` (default: 0)."""
+    without any of them; no finding where no signature is left beside the nuisance. `log_tests`: of `log_counts` (default: 0);
+    `drifts`: those that are curves of time."""
     log_tests = np.zeros(len(signatures)) if log_tests is None else log_tests
     everything = np.column_stack([nuisance, *signatures, residual])
     p = nuisance.shape[1]
@@ -137,14 +149,16 @@ def search(
     best: Finding | None = None
     for k in dict.fromkeys(order):
         with_k = np.column_stack([nuisance, signatures[k]])
-        noise = fit_noise(layout, with_k, residual, null)
+        known = nuisance if k in drifts else with_k
+        noise = fit_noise(layout, known, residual, null)
         narrow = np.column_stack([with_k, residual])
         own = list(range(p, p + signatures[k].shape[1]))
         logs = []
-        for one in noise_draws(layout, with_k, residual, noise, NOISE_DRAWS, rng):
+        for one in noise_draws(layout, known, residual, noise, NOISE_DRAWS, rng):
             value, rank = statistic(project(gram(layout, one, narrow), slice(0, p)), own)
             logs.append(log_tail(value, rank) if rank else 0.0)
-        log_p_k = float(logsumexp(logs) - np.log(len(logs)) + log_tests[k])
+        ratio, rank = likelihood_ratio(layout, nuisance, signatures[k], residual, null, noise)
+        log_p_k = max(float(logsumexp(logs) - np.log(len(logs))), log_tail(ratio, rank) if rank else 0.0) + log_tests[k]
         if best is None or log_p_k < best.log_p:
             value, rank = statistic(project(gram(layout, noise, narrow), slice(0, p)), own)
             best = Finding(k, 1.0, log_p_k, value, rank, noise)
@@ -152,6 +166,29 @@ def search(
     projected = project(gram(layout, best.noise, everything), slice(0, p))
     family = family_wise(projected[p:-1, p:-1], spans(sizes, 0), best.log_p, draws, rng, log_tests)
     return Finding(best.index, family, best.log_p, best.chi2, best.rank, best.noise), null
+
+
+def likelihood_ratio(
+    layout: Layout, nuisance: Array, signature: Array, residual: Array, null: Noise, beside: Noise
+) -> tuple[float, int]:
+    """Λ and q of a `signature` (rows, q) in `residual` (rows,) beside `nuisance` (rows, p).
+
+    null, beside: noise without and with it, from where the likeliest is looked for.
+    """
+    p, noise = nuisance.shape[1], beside
+    whole = np.column_stack([nuisance, signature, residual])
+    rank, lowest = 0, np.inf
+    for _ in range(RATIO_ROUNDS):
+        m = project(gram(layout, noise, whole), slice(0, p))
+        own = [c for c in range(p, p + signature.shape[1]) if m[c, c] > 0.0]
+        if not own:
+            return 0.0, 0
+        inv, rank = inverse(m[np.ix_(own, own)])
+        left = residual - whole[:, own] @ (inv @ m[own, -1])
+        noise = fit_noise(layout, nuisance, left, noise)
+        lowest = min(lowest, deviance(layout, noise, nuisance, left))
+    without = min(deviance(layout, n, nuisance, residual) for n in (null, fit_noise(layout, nuisance, residual, noise)))
+    return max(without - lowest, 0.0), rank
 
 
 def log_counts(effects: Sequence[str], kinds: Sequence[str]) -> Array:

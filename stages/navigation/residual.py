@@ -30,26 +30,24 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from pipeline.errors import InputError
 from pipeline.records import Gnss, Imu, ThermalCorrection
-from pipeline.residual_problem import Candidate, Parameter, Parameters, ResidualProblem
-from stages.navigation import kalman, states
+from pipeline.residual_problem import Basis, Candidate, Parameter, Parameters, ResidualProblem
+from stages.navigation import covariates, kalman, states
 from stages.navigation.measurements import Gathered, at_instants, withheld
 from stages.navigation.pos import declared, settled_start, smooth
+from stages.navigation.recursion import Inputs, carried, signals
 from stages.navigation.settings import NavigationSettings
 from stages.navigation.solve import Problem, Solution, forward
-from stages.navigation.states import NAVIGATION
 from stages.navigation.velocity_lag import taken_off
 from tsmftis.camera import Mounting
 from tsmftis.effects import EFFECTS
 from tsmftis.geodesy import STANDARD_GRAVITY
 from tsmftis.inertial import DEG_PER_H, ImuModel
-from tsmftis.rotation import dcm_to_rpy, quaternion_to_dcm
 
 Array = NDArray[np.float64]
 
@@ -65,9 +63,8 @@ SIGMAS = 5.0  # of the declared scale factor's: a size worth naming
 TOLD, LAG_ROUNDS = 6.0, 4  # sigma of a lag of the velocities that is beyond doubt; rounds in which it is taken off
 VELOCITIES = 3  # components of a fix, before those of its velocity
 VELOCITY_LAG, LARGEST_LAG = "velocity_lag_s", 1.0  # s: more is no filter's
-BIASES = np.arange(states.GROUPS["gyro_bias"].start, states.GROUPS["accel_bias"].stop)
 BEYOND_DOUBT = 1e-3  # p of biases that are left free
-MINUTE, SHORTEST, GROUPS = 60.0, 15.0, 8  # s, s: what is held out is a minute, or an eighth of a shorter flight
+MINUTE, SHORTEST, GROUPS = 60.0, 8.0, 16  # s, s: what is held out is a minute, or a sixteenth of a shorter flight
 FEWEST_FIXES = 20
 KEPT = 8  # linearisations in memory
 EXACT = 1e-6  # relative, of a step
@@ -90,6 +87,44 @@ class Linearisation:
         length = float(self.velocity_lag @ self.velocity_lag)
         share = float(self.velocity_lag @ residual) / length if length > 0.0 else 0.0
         return np.asarray(residual - share * self.velocity_lag)
+
+
+@dataclass(frozen=True)
+class Pass:
+    """The filter run once, all candidates among its states: its chosen fixes, their whitening (k, m, m) and whitened innovations
+    (m·k,)."""
+
+    gathered: Gathered
+    store: kalman.Store
+    count: int
+    active: NDArray[np.int64]
+    fixes: NDArray[np.int64]
+    root: Array
+    residual: Array
+
+    @classmethod
+    def of(cls, problem: Problem, refused: NDArray[np.bool_], chosen: NDArray[np.int64]) -> Pass:
+        """A residual of NaN where the filter fails."""
+        gathered, _, count, store = forward(problem, CANDIDATES, refused)
+        active = states.estimated({*problem.settings.estimate, *CANDIDATES})
+        fixes = gathered.of_fix[chosen]
+        m = int(gathered.measurements.size[fixes[0]])
+        weights = np.where(store.used[fixes, None, None], store.S_inv[fixes, :m, :m], np.eye(m))
+        if not (np.isfinite(weights).all() and np.isfinite(store.y[fixes]).all()):
+            return cls(gathered, store, count, active, fixes, weights, np.full(m * fixes.size, np.nan))
+        root = _roots(weights)
+        return cls(
+            gathered, store, count, active, fixes, root, np.einsum("kij,kj->ik", root, store.y[fixes, :m]).ravel()
+        )
+
+    @property
+    def components(self) -> int:
+        return self.root.shape[1]
+
+    def shown(self, inputs: Inputs, signal: Array) -> Array:
+        """(m·k, q): what errors that the filter does not know of add to the residual."""
+        every = carried(self.store, self.count, self.active, inputs, signal)[self.fixes, : self.components]
+        return np.asarray(np.einsum("kij,kjq->ikq", self.root, every).reshape(self.residual.size, -1))
 
 
 @dataclass
@@ -129,34 +164,46 @@ class Innovations:
         problem = replace(
             self.null, theta=theta, declared=theta, latency=float(theta[states.parameter("gnss_latency")][0])
         )
-        gathered, _, count, store = forward(problem, CANDIDATES, self.refused)
-        active = states.estimated({*problem.settings.estimate, *CANDIDATES})
-        q = len(self.order)
-        begun = np.zeros((active.size, q + 7))  # after the candidates: six biases, velocities that lag
-        begun[np.searchsorted(active, BIASES), q + np.arange(6)] = 1.0
+        done = Pass.of(problem, self.refused, self.chosen)
+        y, q, m = done.residual, len(self.order), done.store.rows.size
+        if not np.isfinite(y).all():
+            none = np.full(y.size, np.nan)
+            return Linearisation(at, none, np.full((none.size, q), np.nan), none, np.full((none.size, 6), np.nan))
+        late = int(np.searchsorted(done.active, states.GROUPS["gnss_latency"].start))
+        # After the candidates: six biases, velocities that lag.
+        inputs = Inputs.none(done.active.size, q + 7, m, np.array([self._latency, q + 6]))
         for column, (effect, name) in enumerate(self.order):
             place = states.GROUPS[effect].start + list(EFFECTS[effect].units).index(name)
-            begun[np.searchsorted(active, place), column] = 1.0
-        fixes = gathered.of_fix[self.chosen]
-        m = int(gathered.measurements.size[fixes[0]])
-        weights = np.where(store.used[fixes, None, None], store.S_inv[fixes, :m, :m], np.eye(m))
-        if not (np.isfinite(weights).all() and np.isfinite(store.y[fixes]).all()):
-            none = np.full(m * fixes.size, np.nan)
-            return Linearisation(at, none, np.full((none.size, q), np.nan), none, np.full((none.size, 6), np.nan))
-        root = _roots(weights)
-        y = np.einsum("kij,kj->ik", root, store.y[fixes, :m])
+            inputs.start[np.searchsorted(done.active, place), column] = 1.0
+        inputs.sensor[q : q + 6] = np.arange(6)
 
         def signatures(jolts: Array) -> Array:
-            carried = np.zeros((store.rows.size, 6, q + 7))
-            late = np.searchsorted(active, states.GROUPS["gnss_latency"].start)
-            _carry(count, active, store, begun.copy(), late, self._latency, jolts, carried)
-            return np.asarray(np.einsum("kij,kjq->ikq", root, carried[fixes, :m]).reshape(y.size, -1))
+            """jolts (m, 3) [m/s²]: what H leaves out of the velocities' derivative by the latency."""
+            inputs.direct[:, 3:, 0] = -jolts
+            inputs.direct[:, 3:, 1] = done.store.H[:, 3:, late] - jolts
+            return done.shown(inputs, np.ones((done.count - 1, 1)))
 
-        s = signatures(np.zeros((store.rows.size, 3)))
-        off, sigma = _beside_all(np.delete(s, q + np.arange(6), axis=1), y.ravel(), self._latency)
+        s = signatures(np.zeros((m, 3)))
+        off, sigma = _beside_all(np.delete(s, q + np.arange(6), axis=1), y, self._latency)
         if abs(off) + 2.0 * sigma < PHASE:
-            s = signatures(_jolts(problem, gathered, count, store))
-        return Linearisation(at, y.ravel(), s[:, :q], s[:, -1], s[:, q:-1])
+            s = signatures(_jolts(problem, done.gathered, done.count, done.store))
+        return Linearisation(at, y, s[:, :q], s[:, -1], s[:, q:-1])
+
+    def bases(self) -> dict[str, Basis]:
+        """Curves that the filter carries on, at the null."""
+        done = Pass.of(self.null, self.refused, self.chosen)
+        columns = done.shown(
+            covariates.inputs_of(done.active, done.store), signals(self.null.imu, done.store, done.count)
+        )
+        fixes = done.gathered.of_fix[self.chosen]
+        late = int(np.searchsorted(done.active, states.GROUPS["gnss_latency"].start))
+        at_fixes = (
+            done.store.H[fixes, :3, late],
+            done.gathered.measurements.rate[fixes],
+            done.gathered.measurements.force[fixes],
+        )
+        norms = [np.tile(np.linalg.norm(v, axis=1), done.components) for v in at_fixes]
+        return covariates.bases_of(columns, *norms)
 
     @property
     def _latency(self) -> int:
@@ -192,35 +239,6 @@ def _jolts(problem: Problem, gathered: Gathered, count: int, store: kalman.Store
     out[at] = np.einsum("kij,kj->ki", store.epoch_dcm[epochs], arm)
     out[gathered.measurements.kind != kalman.FIX] = 0.0
     return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _carry(count, active, store, error, late, latency, jolts, out):  # type: ignore[no-untyped-def]
-    """H·e⁻ (m, 6, q) at every measurement for errors (n, q) at the start, by the filter's own Φ, H and K; `error` is used up.
-
-    The latency is state `late` and column `latency`; the last column is a lag of the velocities alone, which no state holds, the
-    six before it are biases that stay, where the filter's own die away.
-    jolts (m, 3) [m/s²]: what H leaves out of the velocities' derivative by the latency.
-    """
-    n = active.size
-    for e in range(1, count):
-        phi, decay = store.epoch_phi[e - 1], store.epoch_decay[e - 1]
-        moved = phi @ error
-        for j in range(NAVIGATION, n):
-            s = active[j] - NAVIGATION
-            if s < 6:
-                error[j] *= decay[s]
-                error[j, error.shape[1] - 7 + s] += 1.0 - decay[s]
-        error[:NAVIGATION] = moved
-        at = store.epoch_measurement[e]
-        if at >= 0:
-            m = store.rows[at]
-            shown = np.ascontiguousarray(store.H[at, :m]) @ error
-            for i in range(m - 3):
-                shown[3 + i, latency] -= jolts[at, i]
-                shown[3 + i, -1] += store.H[at, 3 + i, late] - jolts[at, i]
-            out[at, :m] = shown
-            error -= np.ascontiguousarray(store.K[at, :, :m]) @ shown
 
 
 def _roots(inverse: Array) -> Array:
@@ -286,7 +304,7 @@ def residual_problem(
         time=np.tile(time, count),
         nuisance=np.hstack([np.zeros((component.size, 0)), *own]),
         channel=component,
-        covariates=_covariates(solution, chosen, count, _temperature(imu)),
+        covariates=covariates.covariates_of(solution, chosen, count, innovations.bases()),
         unit="sigma",
         group_names=names,
         notes=notes,
@@ -417,45 +435,3 @@ def _candidates(model: ImuModel, settings: NavigationSettings) -> tuple[Candidat
         }
         out.append(Candidate(name, parameters))
     return tuple(out)
-
-
-def _temperature(imu: Imu) -> tuple[Array, Array] | None:
-    """Times and mean of the unit's thermometers, where it has any."""
-    t = imu.temperatures
-    if t is None:
-        return None
-    read = [v.reshape(len(t.time), -1) for v in (t.gyro, t.accel) if v is not None]
-    return (t.time, np.nanmean(np.hstack(read), axis=1)) if read else None
-
-
-def _covariates(
-    solution: Solution, chosen: NDArray[np.int64], count: int, temperature: tuple[Array, Array] | None
-) -> dict[str, Array]:
-    """Of the vehicle at each fix; velocity and acceleration are each component's own."""
-    store, gnss = solution.store, solution.problem.gnss
-    fixes = solution.gathered.of_fix[chosen]
-    time = gnss.time[chosen]
-    k = np.searchsorted(solution.problem.imu.time, time).clip(0, store.epoch.size - 1)
-    dcm, velocity = quaternion_to_dcm(store.q[k]), store.velocity[k]
-    roll, pitch, yaw = dcm_to_rpy(dcm)
-    rate, force = solution.gathered.measurements.rate[fixes], solution.gathered.measurements.force[fixes]
-    turning = np.einsum("kij,kj->ki", dcm, rate)
-    acceleration = np.einsum("kij,kj->ki", dcm, force) + np.array([0.0, 0.0, STANDARD_GRAVITY])
-    common = {
-        "time": time,
-        "speed": np.hypot(velocity[:, 0], velocity[:, 1]),
-        "heading north": np.cos(yaw),
-        "heading east": np.sin(yaw),
-        "roll": roll,
-        "pitch": pitch,
-        "turn rate": turning[:, 2],
-        "specific force": np.linalg.norm(force, axis=1),
-        "height": gnss.height[chosen],
-        "sigma of position": np.linalg.norm(gnss.sigma_position[chosen], axis=1),
-    }
-    if temperature is not None:
-        common["temperature"] = np.interp(time, *temperature)
-    out = {name: np.tile(values, count) for name, values in common.items()}
-    out["velocity"] = np.tile(velocity.T, (count // 3, 1)).ravel()
-    out["acceleration"] = np.tile(acceleration.T, (count // 3, 1)).ravel()
-    return {name: values for name, values in out.items() if np.ptp(values) > 0.0}
