@@ -39,11 +39,11 @@ ENTRIES = ((0, 0), (1, 1), (2, 2), *((i, j) for i in range(3) for j in range(3) 
 
 
 def covariates_of(
-    solution: Solution, chosen: Index, count: int, bases: Mapping[str, Basis]
+    solution: Solution, imu: Imu, chosen: Index, count: int, bases: Mapping[str, Basis]
 ) -> dict[str, Array | Basis]:
     """Of the vehicle at each chosen fix (k,), for each of `count` components; velocity and acceleration are each component's own.
 
-    bases: those that the filter carries on (`carried_on`).
+    imu: with its thermometers; bases: those that the filter carries on (`bases_of`).
     """
     store, gnss = solution.store, solution.problem.gnss
     fixes = solution.gathered.of_fix[chosen]
@@ -65,7 +65,7 @@ def covariates_of(
         "height": gnss.height[chosen],
         "sigma of position": np.linalg.norm(gnss.sigma_position[chosen], axis=1),
     }
-    if (temperature := _temperature(solution.problem.imu)) is not None:
+    if (temperature := _temperature(imu)) is not None:
         common["temperature"] = np.interp(time, *temperature)
     out: dict[str, Array | Basis] = {name: np.tile(v, count) for name, v in common.items() if np.ptp(v) > 0.0}
     out["acceleration"] = np.tile(acceleration.T, (count // 3, 1)).ravel()

@@ -304,7 +304,7 @@ def residual_problem(
         time=np.tile(time, count),
         nuisance=np.hstack([np.zeros((component.size, 0)), *own]),
         channel=component,
-        covariates=covariates.covariates_of(solution, chosen, count, innovations.bases()),
+        covariates=covariates.covariates_of(solution, imu, chosen, count, innovations.bases()),
         unit="sigma",
         group_names=names,
         notes=notes,
