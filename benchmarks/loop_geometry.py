@@ -6,8 +6,8 @@ Two lines of 4 s at 22 and 38 °C, 24 control points and 40 pairs of frames each
 are in sigma: the Cramér–Rao bound of the effect in that data set with all other candidates estimated, in the declared noise;
 effects of several parameters get a random direction of that size. Printed: false alarms of clean lines, with the one-sided
 95 % bound; at 4 and 8 sigma how often an effect is found, by its name or in its family, and how far off in sigma (RMS; the
-estimated sigma over the bound); with the effect out of the library (at 8 and 30 sigma), how often a wrong name is forced, and
-what is answered. Figures: docs/closed-loop.md.
+estimated sigma over the bound); what is found of every pair of effects; with the effect out of the library (at 8 and 30 sigma),
+how often a wrong name is forced, and what is answered. Figures: docs/closed-loop.md.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +102,24 @@ def power(settings: SimulationSettings, effects: list[str], trials: int, seed: i
             print(f"{effect:26s} {size:5.0f} | {found:5d} {named:6d} {family:6d} | {off} | {dict(said)}", flush=True)
 
 
+def together(settings: SimulationSettings, effects: list[str], seed: int, size: float) -> None:
+    """Every pair of effects, each of this size."""
+    both = one = more = 0
+    pairs = list(combinations(effects, 2))
+    for trial, pair in enumerate(pairs):
+        rng = np.random.default_rng([seed, trial])
+        names, covariance = bound(problem_of(flown(settings, seed + trial, {})))
+        true = {effect: amount(effect, size, names, covariance, rng) for effect in pair}
+        result = run(problem_of(flown(settings, seed + trial, true)), LoopSettings(), trial)
+        hits = sum(any(e in (s.effect, *s.indistinguishable_from) for s in result.steps) for e in pair)
+        both, one, more = both + (hits == 2), one + (hits == 1), more + (len(result.steps) > 2)
+        if hits < 2 or len(result.steps) > 2:
+            print(f"  {' and '.join(pair)}: {answered(result)}", flush=True)
+    print(
+        f"two at once, {size:g} sigma each: both in {both} of {len(pairs)}, one in {one}, something beside them in {more}"
+    )
+
+
 def left_out(
     settings: SimulationSettings, effects: list[str], trials: int, seed: int, sizes: tuple[float, ...]
 ) -> None:
@@ -132,6 +151,7 @@ def main() -> None:
     some = max(given.trials // 4, 4)
     false_alarms(settings, given.trials, given.seed)
     power(settings, effects, some, given.seed, (4.0, 8.0))
+    together(settings, effects, given.seed, 8.0)
     left_out(settings, effects, some, given.seed, (8.0, 30.0))
 
 

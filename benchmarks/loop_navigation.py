@@ -5,7 +5,8 @@
 Flights of two minutes and a half with turns to both sides in gusts, fixes every half second, two grades of unit. An effect acts
 on one axis, at multiples of its sigma with everything else estimated (Cramér–Rao; of a scale factor it holds the declared
 scatter), not beyond what it can physically be. Printed: false alarms on clean flights with the one-sided 95 % bound, detection,
-whom an effect was taken for, errors in sigma, and what is answered when the effect is not in the library.
+whom an effect was taken for, errors in sigma, what is found of every pair of effects, and what is answered when the effect is
+not in the library.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 
 import numpy as np
 import simulated
@@ -37,6 +39,7 @@ Effects = Mapping[str, Mapping[str, float]]
 
 NAMES = ("antenna_lever_arm", "gnss_latency", "gyro_scale_factor", "accel_scale_factor", "gyro_g_sensitivity")
 SIZES = (4.0, 8.0)
+PAIR = 8.0  # sigma of each of two effects
 WITHOUT = 15.0  # sigma of an effect that is not in the library
 PATHS = 4
 SPAN = 0.5  # s between fixes
@@ -163,6 +166,21 @@ def main() -> None:
     for effect in NAMES:
         counted = sorted(((n, c) for (e, n), c in taken.items() if e == effect), key=lambda x: -x[1])
         print(f"  {effect:<22}" + ", ".join(f"{n} {c}" for n, c in counted))
+
+    print(f"\ntwo at once, {PAIR:g} sigma each")
+    pairs = list(combinations(NAMES, 2))
+    both = one = more = 0
+    for grade in (RLG, MEMS):
+        for i, pair in enumerate(pairs * max(a.trials // 6, 1)):
+            path = i % PATHS
+            joint = one_axis(grade, path, pair[0], i, PAIR) | one_axis(grade, path, pair[1], i + 1, PAIR)
+            result = run(problem(grade, path, base + 2000 + i, joint), settings, i)
+            hits = sum(told(result, effect) for effect in pair)
+            both, one, more = both + (hits == 2), one + (hits == 1), more + (len(result.steps) > 2)
+            if hits < 2 or len(result.steps) > 2:
+                print(f"  {grade.name:<6}{' and '.join(pair)}: {answer(result)}", flush=True)
+    total = 2 * len(pairs) * max(a.trials // 6, 1)
+    print(f"  both in {both} of {total}, one in {one}, something beside them in {more}", flush=True)
 
     print(f"\nnot in the library, {WITHOUT:g} sigma")
     for grade in (RLG, MEMS):
