@@ -115,6 +115,8 @@ class ResidualProblem:
     covariates  name → (n,): what the remainder may depend on if no candidate accounts for it; NaN: not this sample
     sigma       the white noise's standard deviation where it is declared, one number or (n,) with NaN where it is not: more
                 than it, and serially correlated, is structure
+    drifts      whether the noise may be a slow drift, than which a slow signature must be likelier; not where the stage knows its
+                noise and has whitened it
     floor       RMS of the residual that is the method's own accuracy: below it nothing is looked for
     unit        of the residual, for a reader
     notes       what a reader must be told of the data, such as what was left out
@@ -131,6 +133,7 @@ class ResidualProblem:
     channel: Labels | None = None
     covariates: Mapping[str, Array | Basis] = field(default_factory=dict)
     sigma: float | Array | None = None
+    drifts: bool = True
     floor: float = 0.0
     unit: str = "1"
     group_names: Mapping[int, str] = field(default_factory=dict)

@@ -121,10 +121,11 @@ class Factor:
 
 @dataclass(frozen=True)
 class Layout:
-    """The samples `rows` of a problem, by channel."""
+    """The samples `rows` of a problem, by channel; `drifts`: see `ResidualProblem`."""
 
     rows: Index
     channels: tuple[Channel, ...]
+    drifts: bool = True
 
     @classmethod
     def of(cls, problem: ResidualProblem, rows: Index) -> Layout:
@@ -137,7 +138,7 @@ class Layout:
             starts = np.append(True, np.diff(series) != 0)[: index.size]
             step = np.append(1.0, np.diff(time))[: index.size]
             channels.append(Channel(index, np.where(starts, 1.0, step), starts))
-        return cls(rows, tuple(channels))
+        return cls(rows, tuple(channels), problem.drifts)
 
 
 def gram(layout: Layout, noise: Noise, columns: Array) -> Array:

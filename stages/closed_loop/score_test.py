@@ -11,8 +11,8 @@ white; or that of the likelihood ratio, if it is larger:
     Λ_k = min_K D(r; K) − min_{K, β} D(r − S_k·β; K) ~ χ²_q,      D = −2·l restricted by N alone
 
 A slow signature takes from r what tells that the noise is slow, so that the noise left beside it seems whiter than it is; the
-ratio lets each side have the noise that suits it. A curve of time is what coloured noise looks like, and is judged in the noise
-without it.
+ratio lets each side have the noise that suits it. Where the stage knows its noise, as picks and detectors have it, no drift is to
+be feared, and it is not asked for. A curve of time is what coloured noise looks like, and is judged in the noise without it.
 
 An effect that makes n tests (a grid) pays for them itself: its p-values count n times, so that effects of one test do not lose
 power to it; so do its kinds of hypothesis (one number for several sensors, one sensor, several): n tests of one of m kinds count
@@ -157,8 +157,11 @@ def search(
         for one in noise_draws(layout, known, residual, noise, NOISE_DRAWS, rng):
             value, rank = statistic(project(gram(layout, one, narrow), slice(0, p)), own)
             logs.append(log_tail(value, rank) if rank else 0.0)
-        ratio, rank = likelihood_ratio(layout, nuisance, signatures[k], residual, null, noise)
-        log_p_k = max(float(logsumexp(logs) - np.log(len(logs))), log_tail(ratio, rank) if rank else 0.0) + log_tests[k]
+        log_p_k = float(logsumexp(logs) - np.log(len(logs)))
+        if layout.drifts:
+            ratio, rank = likelihood_ratio(layout, nuisance, signatures[k], residual, null, noise)
+            log_p_k = max(log_p_k, log_tail(ratio, rank) if rank else 0.0)
+        log_p_k += float(log_tests[k])
         if best is None or log_p_k < best.log_p:
             value, rank = statistic(project(gram(layout, noise, narrow), slice(0, p)), own)
             best = Finding(k, 1.0, log_p_k, value, rank, noise)

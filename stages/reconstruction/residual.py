@@ -96,6 +96,7 @@ def problem_of(
         time=samples.col,
         nuisance=np.column_stack([model.levels, model.phase_columns()]),
         covariates=covariates_of(model),
+        drifts=False,
         sigma=1.0,
         unit="sigma",
         group_names=dict(enumerate(samples.names)),

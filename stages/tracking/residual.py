@@ -334,6 +334,7 @@ def residual_problem(
         covariates=made.covariates(),
         # Of picks it is declared; of the images' motion it is a guess.
         sigma=np.where(made.channel < 2, 1.0, np.nan)[order],
+        drifts=False,
         unit="sigma",
         group_names=names,
     )
