@@ -63,7 +63,7 @@ def close(
             e1, l1, _ = confirmation.held_out(problem, rows, held, after, noise)
         name = problem.group_names.get(sealed, str(sealed))
         once = Sealed(name, float(np.sqrt(np.mean(e0**2))), float(np.sqrt(np.mean(e1**2))), l1 - l0)
-        if steps and once.log_likelihood < -settings.decisive and once.after > (1.0 - settings.gain) * once.before:
+        if steps and once.log_likelihood < -settings.decisive and once.after > once.before:
             names = ", ".join(s.effect for s in steps)
             state.notes.append(
                 f"taken back, {names}: the sealed group {name} is worse with it,"
