@@ -289,7 +289,7 @@ def residual_problem(
         told = f"the velocities are {1e3 * abs(lag):.3g} ± {1e3 * sigma:.2g} ms {'late' if lag > 0.0 else 'early'}"
         notes = (f"{told} against the positions of their fixes, and are taken at those instants here",)
     own = [first.velocity_lag[:, None]] if count > VELOCITIES else []
-    if correction is not None and _biases_stand_out(near):
+    if _biases_stand_out(near):
         own.append(first.biases)
         notes += ("beside every effect, the flight asks for biases beyond those declared: they are left free",)
     time = gnss.time[chosen]
@@ -305,6 +305,7 @@ def residual_problem(
         nuisance=np.hstack([np.zeros((component.size, 0)), *own]),
         channel=component,
         covariates=covariates.covariates_of(solution, imu, chosen, count, innovations.bases()),
+        drifts=False,
         unit="sigma",
         group_names=names,
         notes=notes,
@@ -313,8 +314,8 @@ def residual_problem(
 
 
 def _biases_stand_out(near: Linearisation) -> bool:
-    """Whether the flight asks for biases that neither their declared sigmas nor any candidate give: what a sensor does with
-    gravity in the chamber, its compensation has taken for a bias there.
+    """Whether the flight asks for biases that neither their declared sigmas nor any candidate give: they are declared too small, or
+    a compensation has taken for a bias what the sensor does with gravity in the chamber.
     """
     rest = np.column_stack([near.signatures, near.velocity_lag])
     left = []
