@@ -314,8 +314,8 @@ def residual_problem(
 
 
 def _biases_stand_out(near: Linearisation) -> bool:
-    """Whether the flight asks for biases that neither their declared sigmas nor any candidate give: they are declared too small, or
-    a compensation has taken for a bias what the sensor does with gravity in the chamber.
+    """Whether the flight asks for biases that neither their declared sigmas nor any candidate give: these are too small, or a
+    compensation has taken for a bias what the sensor does with gravity in the chamber.
     """
     rest = np.column_stack([near.signatures, near.velocity_lag])
     left = []
