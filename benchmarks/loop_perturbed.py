@@ -180,6 +180,8 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", metavar="NAME[&NAME]", default=[*CASES, *COMBINED])
     parser.add_argument("--list", action="store_true")
     a = parser.parse_args()
+    if unknown := [one for name in a.only for one in name.split("&") if one not in CASES]:
+        parser.error(f"no such change: {', '.join(unknown)}; --list names them all")
     if a.list:
         print("\n".join(f"{name:<30} {case(name)[1] or 'no name'}" for name in a.only))
         return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.residual_problem import Candidate, Parameter, Parameters, ResidualProblem, joined
+from pipeline.residual_problem import Basis, Candidate, Parameter, Parameters, ResidualProblem, joined
 
 CANDIDATE = Candidate("offset", {"k": Parameter("m", 1.0)})
 
@@ -40,6 +40,28 @@ def test_problems_of_one_instrument_are_joined_under_one_set_of_parameters() -> 
     assert both.group_names == {0: "F1 first", 1: "F1 second", 2: "F2 first", 3: "F2 second"}
     np.testing.assert_array_equal(both.nuisance, np.repeat(np.eye(2), [6, 10], axis=0))
     assert list(both.covariates) == ["time"] and joined({"F1": parts["F1"]}) is parts["F1"]
+
+
+def test_bases_are_joined_where_a_coefficient_means_the_same_everywhere() -> None:
+    def with_bases(n: int, count: int) -> ResidualProblem:
+        columns = np.arange(n * 2.0).reshape(n, 2)
+        at, curves = np.arange(1.0 * n), {"b": np.ones((n, 2))}
+        named = {
+            "common": Basis(columns, np.ones(n), at, curves, common=True),
+            "own": Basis(columns, np.ones(n), at, curves),
+        }
+        more = Basis(np.ones((n, count)), np.ones(n), at, curves, common=True)
+        return problem(n, 1.0, covariates={**named, "unlike": more})
+
+    parts = {"F1": with_bases(6, 1), "F2": with_bases(10, 2)}
+    both = joined(parts)
+    assert list(both.covariates) == ["common"]
+    basis = both.covariates["common"]
+    assert isinstance(basis, Basis) and basis.at.size == 10
+    np.testing.assert_array_equal(
+        basis.columns,
+        np.vstack([p.covariates["common"].columns for p in parts.values()]),  # type: ignore[union-attr]
+    )
 
 
 @pytest.mark.parametrize(
