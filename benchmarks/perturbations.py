@@ -118,6 +118,11 @@ def dem_changed(change: Callable[[np.ndarray], np.ndarray] | None, shift_m: floa
         file.write((change(heights) if change else heights).astype(heights.dtype), 1)
 
 
+def misaligned(name: str, axis: int, other: int, angle: float, d: xr.Dataset) -> None:
+    """A sensor shows a part of what another axis turns or feels."""
+    d[name].values[:, axis] += angle * d[name].values[:, other]
+
+
 def velocity_lag(seconds: float, d: xr.Dataset) -> None:
     """Velocities as they were some time before their stamp."""
     for axis in range(3):

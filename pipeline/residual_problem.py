@@ -120,6 +120,7 @@ class ResidualProblem:
     floor       RMS of the residual that is the method's own accuracy: below it nothing is looked for
     unit        of the residual, for a reader
     notes       what a reader must be told of the data, such as what was left out
+    unnamed     structure that the stage has found beyond doubt, and taken up in N, though its model knows nothing of it
     beside      what was estimated of the instrument beforehand, that is no candidate, by name
     """
 
@@ -138,6 +139,7 @@ class ResidualProblem:
     unit: str = "1"
     group_names: Mapping[int, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    unnamed: tuple[str, ...] = ()
     beside: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -163,7 +165,7 @@ class ResidualProblem:
 def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
     """Problems of one instrument under one set of parameters, by name (a flight's), one after the other.
 
-    Groups, series, channels, notes and nuisance are each problem's own; candidates, sigma and floor those of the first;
+    Groups, series, channels, notes, what is unnamed and nuisance are each problem's own; candidates, sigma and floor those of the first;
     covariates those that all have, of bases the common ones. A single problem stays as it is.
     """
     parts = list(problems.values())
@@ -195,6 +197,7 @@ def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
         covariates={k: v for k, v in covariates.items() if v is not None},
         group_names=names,
         notes=tuple(f"{name}: {note}" for name, part in problems.items() for note in part.notes),
+        unnamed=tuple(f"{name}: {one}" for name, part in problems.items() for one in part.unnamed),
     )
 
 

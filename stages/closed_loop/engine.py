@@ -42,7 +42,12 @@ def run(problem: ResidualProblem, settings: LoopSettings, seed: int) -> LoopResu
     null = np.asarray(problem.residual({}), float)
     if null.shape != problem.group.shape or not np.isfinite(null[rows]).all():
         raise ValueError(f"{problem.stage}: the residual has shape {null.shape} or is not finite")
-    state = State(np.asarray(problem.nuisance, float), null, notes=list(problem.notes))
+    state = State(
+        np.asarray(problem.nuisance, float),
+        null,
+        notes=[*problem.notes, *problem.unnamed],
+        certain=list(problem.unnamed),
+    )
     candidates = {c.effect: c for c in problem.candidates}
     state.noise = fit_noise(layout, state.nuisance[rows], null[rows])
     limits, considered = _first_look(problem, layout, state, candidates, settings)

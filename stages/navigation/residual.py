@@ -289,9 +289,10 @@ def residual_problem(
         told = f"the velocities are {1e3 * abs(lag):.3g} ± {1e3 * sigma:.2g} ms {'late' if lag > 0.0 else 'early'}"
         notes = (f"{told} against the positions of their fixes, and are taken at those instants here",)
     own = [first.velocity_lag[:, None]] if count > VELOCITIES else []
+    unnamed: tuple[str, ...] = ()
     if _biases_stand_out(near):
         own.append(first.biases)
-        notes += ("beside every effect, the flight asks for biases beyond those declared: they are left free",)
+        unnamed = ("beside every effect, the flight asks for biases beyond those declared: they are left free",)
     time = gnss.time[chosen]
     group, names = _groups(time)
     component = np.repeat(np.arange(count), chosen.size)
@@ -309,6 +310,7 @@ def residual_problem(
         unit="sigma",
         group_names=names,
         notes=notes,
+        unnamed=unnamed,
         beside={} if lag == 0.0 else {VELOCITY_LAG: float(lag)},
     )
 

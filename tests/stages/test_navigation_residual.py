@@ -118,6 +118,16 @@ def test_errors_that_the_filter_carries_on_are_those_of_exact_passes() -> None:
         assert abs(a @ b) > 0.95 * np.linalg.norm(a) * np.linalg.norm(b)
 
 
+def test_biases_beyond_those_declared_are_left_free_and_told() -> None:
+    """Twenty times the declared sigma, in one accelerometer; a third of it is no matter."""
+    imu, gnss, initial = recorded(RLG, 0, 3, {})
+    for times, told in ((0.3, False), (20.0, True)):
+        shifted = replace(imu, accel=imu.accel + [times * RLG.model.accel.bias_sigma, 0.0, 0.0])
+        p = residual_problem(shifted, gnss, RLG.model, Mounting(LEVER), NavigationSettings(), initial=initial)
+        assert bool(p.unnamed) == told and p.nuisance.shape[1] == (7 if told else 1)
+        assert run(p, QUICK, 1).verdict == ("unexplained" if told else "no_effect")
+
+
 @pytest.mark.parametrize(
     ("effect", "axis", "size", "covariate"),
     [
