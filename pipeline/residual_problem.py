@@ -165,8 +165,8 @@ class ResidualProblem:
 def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
     """Problems of one instrument under one set of parameters, by name (a flight's), one after the other.
 
-    Groups, series, channels, notes, what is unnamed and nuisance are each problem's own; candidates, sigma and floor those of the first;
-    covariates those that all have, of bases the common ones. A single problem stays as it is.
+    Groups, series, channels, notes, what is unnamed and nuisance are each problem's own; candidates, sigma and floor those of the
+    first; covariates those that all have, of bases the common ones. A single problem stays as it is.
     """
     parts = list(problems.values())
     first = parts[0]

@@ -292,7 +292,9 @@ def residual_problem(
     unnamed: tuple[str, ...] = ()
     if _biases_stand_out(near):
         own.append(first.biases)
-        unnamed = ("beside every effect, the flight asks for biases beyond those declared: they are left free",)
+        told = "beside every effect, the flight asks for biases beyond those declared: they are left free"
+        # Of an uncompensated unit temperature may have made them; of a compensated one something that has no name.
+        notes, unnamed = (notes, (told,)) if correction is not None else ((*notes, told), ())
     time = gnss.time[chosen]
     group, names = _groups(time)
     component = np.repeat(np.arange(count), chosen.size)

@@ -16,7 +16,7 @@ from simulated import LEVER, MEMS, RLG, SIGMA_VELOCITY
 
 from pipeline.campaign import read_campaign
 from pipeline.errors import InputError
-from pipeline.records import Gnss
+from pipeline.records import Gnss, ThermalCorrection
 from pipeline.residual_problem import Basis, ResidualProblem
 from stages.closed_loop import LoopResult, LoopSettings, run
 from stages.closed_loop.signatures import derivatives
@@ -119,13 +119,18 @@ def test_errors_that_the_filter_carries_on_are_those_of_exact_passes() -> None:
 
 
 def test_biases_beyond_those_declared_are_left_free_and_told() -> None:
-    """Twenty times the declared sigma, in one accelerometer; a third of it is no matter."""
+    """Twenty times the declared sigma, in one accelerometer; a third of it is no matter. A compensated unit should have none."""
     imu, gnss, initial = recorded(RLG, 0, 3, {})
-    for times, told in ((0.3, False), (20.0, True)):
-        shifted = replace(imu, accel=imu.accel + [times * RLG.model.accel.bias_sigma, 0.0, 0.0])
-        p = residual_problem(shifted, gnss, RLG.model, Mounting(LEVER), NavigationSettings(), initial=initial)
-        assert bool(p.unnamed) == told and p.nuisance.shape[1] == (7 if told else 1)
-        assert run(p, QUICK, 1).verdict == ("unexplained" if told else "no_effect")
+    knots, three = imu.time[[0, -1]], np.zeros((2, 3))
+    nothing = ThermalCorrection(knots, three, three, three, three, np.zeros((2, 6)))
+    for times, correction in ((0.3, nothing), (20.0, None), (20.0, nothing)):
+        shifted = replace(imu, accel=imu.accel + times * RLG.model.accel.bias_sigma * np.array([1.0, 0.0, 0.0]))
+        p = residual_problem(
+            shifted, gnss, RLG.model, Mounting(LEVER), NavigationSettings(), initial=initial, correction=correction
+        )
+        far = times > 1.0
+        assert p.nuisance.shape[1] == (7 if far else 1) and any("left free" in n for n in (*p.notes, *p.unnamed)) == far
+        assert run(p, QUICK, 1).verdict == ("unexplained" if far and correction else "no_effect")
 
 
 @pytest.mark.parametrize(
