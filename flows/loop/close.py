@@ -38,6 +38,7 @@ from tsmftis import __version__
 
 SCHEMA = "tsmftis-loop/1"
 BEFORE, AFTER, UPDATE = "before", "after", "model-update.yaml"
+DOUBTFUL_PATH = "navigation left something unexplained: what is added here may stand for an error of the path"
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def close_loop_flow(plan: Plan, seed: int) -> Closed:
     records = _campaign(before)
     write_run(before, first := assemble(before, records))
     parts, missing = parts_of(before)
-    update, answers = ModelUpdate(), {}
+    update, answers = ModelUpdate(), dict[str, dict[str, Any]]()
     made = records
     for part in parts:
         now = replace(after, update=update) if _changes(update) else before
@@ -96,7 +97,7 @@ def close_loop_flow(plan: Plan, seed: int) -> Closed:
         if record.problem is not None:
             missing[part.name] = str(record.problem)
             continue
-        answers[part.name] = record.summary
+        answers[part.name] = _doubted(part, record.summary, answers)
         update = _with(update, part, record.summary, alone=_is_all(before))
     if not answers:
         problem = next((record.problem for record in records if record.problem is not None), None)
@@ -169,6 +170,14 @@ def _take_over(before: Path, after: Path) -> None:
 def _changes(update: ModelUpdate) -> bool:
     """Whether it changes what a run over the campaign makes of its flights."""
     return bool(update.effects or update.receiver or tracking.applied(update.learned))
+
+
+def _doubted(part: Part, answer: dict[str, Any], before: Answers) -> dict[str, Any]:
+    """The answer of a part, with a word of warning where geometry adds something to a path that navigation could not explain."""
+    path = before.get("navigation", {}).get("verdict")
+    if part.stage != "geometry" or not answer["steps"] or path != "unexplained":
+        return answer
+    return answer | {"notes": [*answer["notes"], DOUBTFUL_PATH]}
 
 
 def _with(update: ModelUpdate, part: Part, answer: dict[str, Any], alone: bool) -> ModelUpdate:

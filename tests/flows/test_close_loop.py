@@ -14,7 +14,7 @@ import xarray as xr
 import yaml
 from tiny_campaign import tiny_campaign
 
-from flows.loop import problems
+from flows.loop import close, problems
 from flows.loop.problems import Part
 from pipeline.datasets import write_dataset
 from pipeline.errors import InputError
@@ -174,6 +174,16 @@ def test_wrong_input_ends_in_one_line(laboratory: Path, tmp_path: Path, tsmftis:
         answer = tsmftis("close-loop", *arguments)
         assert answer.code == 2 and part in answer.err and answer.err.count("\n") == 1, answer.err
     assert not (tmp_path / "out").exists()
+
+
+def test_what_geometry_adds_to_an_unexplained_path_is_doubted() -> None:
+    added = {"steps": [{"effect": "boresight"}], "notes": ["one"]}
+    for verdict, doubted in (("unexplained", True), ("no_effect", False)):
+        told = close._doubted(Part("geometry"), added, {"navigation": {"verdict": verdict}})
+        assert told["notes"] == ["one"] + [close.DOUBTFUL_PATH] * doubted
+    nothing = {"steps": [], "notes": []}
+    assert close._doubted(Part("geometry"), nothing, {"navigation": {"verdict": "unexplained"}}) == nothing
+    assert close._doubted(Part("spectral"), added, {"navigation": {"verdict": "unexplained"}}) == added
 
 
 def test_a_flight_that_cannot_serve_leaves_the_others_their_turn(monkeypatch: pytest.MonkeyPatch) -> None:
