@@ -132,7 +132,8 @@ def search(
     order: list[int] = []
     sizes = [s.shape[1] for s in signatures]
     lowest = 1.0
-    for noise in (null, fit_noise(layout, np.column_stack([nuisance, *signatures]), residual, null)):
+    # Not from `null`: where an effect is strong, that is another maximum, and a search from there would stay in it.
+    for noise in (null, fit_noise(layout, np.column_stack([nuisance, *signatures]), residual)):
         projected = project(gram(layout, noise, everything), slice(0, p))
         log_p = _log_p(projected, where) + log_tests
         good = [int(k) for k in np.argsort(log_p)[:LOOKED_AT] if np.isfinite(log_p[k])]
@@ -150,7 +151,7 @@ def search(
     for k in dict.fromkeys(order):
         with_k = np.column_stack([nuisance, signatures[k]])
         known = nuisance if k in drifts else with_k
-        noise = fit_noise(layout, known, residual, null)
+        noise = null if k in drifts else fit_noise(layout, known, residual)
         narrow = np.column_stack([with_k, residual])
         own = list(range(p, p + signatures[k].shape[1]))
         logs = []
