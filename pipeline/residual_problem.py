@@ -76,8 +76,9 @@ class Candidate:
 class Basis:
     """A covariate whose curves reach the samples in the stage's own way (as differences, in several channels of unlike noise).
 
-    columns (n, k): curves of the covariate as they show in the samples, the straight line first, none constant in the
-    covariate; values (n,): the covariate at each sample, NaN where it has none; at (m,) and curves, name → (m, k): what the
+    columns (n, k): curves of the covariate as they show in the samples, none constant in the covariate, the straight line first
+    where they are `smooth`, which penalises the others; values (n,): the covariate at each sample, with which the size of an
+    effect must not change (NaN: not asked); at (m,) and curves, name → (m, k): what the
     columns stand for, for a table; unit of the covariate, units of the curves by their names; common: a coefficient means
     the same in every problem that has the covariate.
     """
@@ -89,6 +90,7 @@ class Basis:
     unit: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
     common: bool = False
+    smooth: bool = True
 
     @classmethod
     def scaled(cls, columns: Array, values: Array, at: Array, curves: Array, named: tuple[str, str, str]) -> Basis:
@@ -112,7 +114,7 @@ class ResidualProblem:
     nuisance    (n, p) columns N of what the stage's own model takes up; those that are zero outside one group are that group's
                 own, and are fitted there when it is held out
     channel     (n,) samples of one channel share their noise's variances (default: all of them)
-    covariates  name → (n,): what the remainder may depend on if no candidate accounts for it; NaN: not this sample
+    covariates  name → (n,), NaN: not this sample, or a basis: what the remainder may depend on if no candidate accounts for it
     sigma       the white noise's standard deviation where it is declared, one number or (n,) with NaN where it is not: more
                 than it, and serially correlated, is structure
     drifts      whether the noise may be a slow drift, than which a slow signature must be likelier; not where the stage knows its
@@ -165,8 +167,8 @@ class ResidualProblem:
 def joined(problems: Mapping[str, ResidualProblem]) -> ResidualProblem:
     """Problems of one instrument under one set of parameters, by name (a flight's), one after the other.
 
-    Groups, series, channels, notes, what is unnamed and nuisance are each problem's own; candidates, sigma and floor those of the
-    first; covariates those that all have, of bases the common ones. A single problem stays as it is.
+    Groups, series, channels, notes, what is unnamed and nuisance are each problem's own; all else is the first's;
+    covariates those that all have, of bases the common ones. A single problem stays as it is.
     """
     parts = list(problems.values())
     first = parts[0]

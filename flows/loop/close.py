@@ -174,8 +174,7 @@ def _changes(update: ModelUpdate) -> bool:
 
 def _doubted(part: Part, answer: dict[str, Any], before: Answers) -> dict[str, Any]:
     """The answer of a part, with a word of warning where geometry adds something to a path that navigation could not explain."""
-    path = before.get("navigation", {}).get("verdict")
-    if part.stage != "geometry" or not answer["steps"] or path != "unexplained":
+    if part.stage != "geometry" or not answer["steps"] or not before.get("navigation", {}).get("unexplained"):
         return answer
     return answer | {"notes": [*answer["notes"], DOUBTFUL_PATH]}
 

@@ -123,6 +123,7 @@ def content_of(part: Part, problem: ResidualProblem, result: LoopResult) -> dict
             step | {"parameters": gathered(step["effect"], step["parameters"])} | units_of(problem, step)
             for step in content["steps"]
         ],
+        "unexplained": result.unexplained,
         "considered": plain(result.considered),
         "sealed": plain(result.sealed),
         "heldout_rms": {

@@ -107,6 +107,7 @@ def close(
         tuple(state.notes),
         tuple(replace(c, outcome=_outcome(c.effect, steps, state)) for c in considered.values()),
         _pictures(problem, state, null, noise),
+        bool(state.certain),
     )
 
 

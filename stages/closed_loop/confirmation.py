@@ -66,6 +66,11 @@ class Confirmation:
     same_sign: bool
     without_best: float = 0.0
 
+    @property
+    def repeats(self) -> bool:
+        """Whether what one part of the data shows helps another part at all: else it is no structure of the instrument."""
+        return self.gain > 0.0 and self.log_likelihood > 0.0
+
     def passes(self, gain: float, decisive: float) -> bool:
         enough = self.folds >= FEWEST_FOLDS
         likelier = enough and self.without_best > 0.0 and self.log_likelihood >= decisive and self.gain > -gain

@@ -28,7 +28,6 @@ from stages.closed_loop.signatures import Member, Values, members, tied, untied
 from stages.closed_loop.state import CERTAIN, State, rms
 from stages.closed_loop.wording import p_text
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 SEALED_FROM = 4  # groups
@@ -147,7 +146,15 @@ def _named_step(
         signatures = [m.columns[rows] for m in found]
         tests = log_counts([m.effect for m in found], [m.kind for m in found])
         finding, state.noise = search(
-            layout, columns[rows], signatures, data[rows], state.noise, settings.draws, rng, tests
+            layout,
+            columns[rows],
+            signatures,
+            data[rows],
+            state.noise,
+            settings.draws,
+            rng,
+            tests,
+            drifts=problem.drifts,
         )
         if finding is None or finding.p > settings.p_value:
             return False

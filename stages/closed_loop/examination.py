@@ -22,14 +22,14 @@ from pipeline.residual_problem import Basis, Candidate, ResidualProblem
 from stages.closed_loop import confirmation, identifiability
 from stages.closed_loop.confirmation import Model
 from stages.closed_loop.estimation import Estimate, descend, estimate
+from stages.closed_loop.learned import splines_of
 from stages.closed_loop.noise import Layout, Noise, fit_noise, gram
-from stages.closed_loop.remainder import splines_of
 from stages.closed_loop.result import Step
 from stages.closed_loop.score_test import Finding, project, solve, spans, statistic
 from stages.closed_loop.settings import LoopSettings
 from stages.closed_loop.signatures import Member, merged
 from stages.closed_loop.state import UNNEEDED, State
-from stages.closed_loop.wording import controls_text, held_out_text, noise_text, p_text, repeats, why_not
+from stages.closed_loop.wording import controls_text, held_out_text, noise_text, p_text, why_not
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -84,11 +84,15 @@ def examine(
         return Refusal(f"{reached} of {valid} shifted copies of its signature do as well", False)
     term = data - estimated.residual
     helped = _beside(layout, columns, data, term, found, member.effect, estimated.noise)
-    if winner := _better_covariate(problem, layout, helped, columns, data, term, estimated.noise):
+    if winner := _better_covariate(
+        problem, layout, helped, columns, data, term, estimated.noise, settings.spline_columns
+    ):
         return Refusal(f"a spline of {winner} explains the same and more, and leaves nothing for it", True)
 
     if worst := _varies_with(problem, layout, helped, p, data, term, estimated.noise):
-        return Refusal(f"its size changes with {worst}: it stands for something else", True, channel_of(problem, worst))
+        return Refusal(
+            f"its size changes with {worst}: it stands for something else", True, _channel_of(problem, worst)
+        )
     before = Model(data, columns)
     library = [Model(data, np.column_stack([columns, m.columns])) for m in found]
     own = tuple(state.nuisance.shape[1] + c for c in estimated.columns(member.effect))
@@ -111,7 +115,7 @@ def examine(
         refine,
     )
     if not checked.passes(settings.gain, settings.decisive):
-        return Refusal(why_not(checked), repeats(checked))
+        return Refusal(why_not(checked), checked.repeats)
     tests = f"largest of {len(found)} tests, {noise_text(problem, finding.noise)}"
     evidence = f"p {p_text(finding.p)} ({tests}); {held_out_text(problem, checked)}; {controls_text(reached, valid)}"
     if rivals:
@@ -210,7 +214,14 @@ def _centred(covariate: Array | Basis, rows: Index) -> Array:
 
 
 def _better_covariate(
-    problem: ResidualProblem, layout: Layout, helped: Array, columns: Array, data: Array, term: Array, noise: Noise
+    problem: ResidualProblem,
+    layout: Layout,
+    helped: Array,
+    columns: Array,
+    data: Array,
+    term: Array,
+    noise: Noise,
+    count: int,
 ) -> str | None:
     """The covariate whose spline leaves nothing of the effect's term, while the term leaves much of the spline; or of which the
     term is itself a curve, while the data ask for another one.
@@ -219,7 +230,7 @@ def _better_covariate(
     """
     rows, p = layout.rows, columns.shape[1]
     winner, lowest = None, COVARIATE_WINS / max(len(problem.covariates), 1)
-    for name, spline in splines_of(problem, layout).items():
+    for name, spline in splines_of(problem, layout, count).items():
         q = spline.shape[1]
         extra = fit_noise(layout, np.column_stack([columns[rows], term[rows], spline[rows]]), data[rows], noise)
         m = gram(layout, extra, np.column_stack([helped, spline[rows], data[rows]]))
@@ -237,7 +248,7 @@ def _better_covariate(
     return winner
 
 
-def channel_of(problem: ResidualProblem, covariate: str) -> int | None:
+def _channel_of(problem: ResidualProblem, covariate: str) -> int | None:
     """The channel that a covariate alone is of."""
     if problem.channel is None or covariate not in problem.covariates:
         return None

@@ -8,6 +8,7 @@ b are natural cubic spline columns of the covariate x on its quantiles, turned s
 Functions
 ---------
 spline_columns   the columns: the straight line first, then by growing roughness
+splines_of       those of every covariate of a problem
 ridge            the penalties that the data ask for
 curve            the term on a few values of the covariate, for a table
 
@@ -24,6 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from pipeline.residual_problem import Basis, ResidualProblem
+from stages.closed_loop.noise import Layout
 from stages.closed_loop.score_test import project
 
 Array = NDArray[np.float64]
@@ -71,6 +74,18 @@ def spline_columns(covariate: Array, at: Array) -> Array:
     flat = np.column_stack([np.ones(covariate.size), line])
     columns = columns - flat @ np.linalg.lstsq(flat, columns, rcond=None)[0]
     return np.column_stack([line, columns[:, ::-1] / np.sqrt(np.mean(columns**2))])
+
+
+def splines_of(problem: ResidualProblem, layout: Layout, count: int) -> dict[str, Array]:
+    out = {}
+    for name, covariate in problem.covariates.items():
+        if isinstance(covariate, Basis):
+            columns = covariate.columns
+        else:
+            columns = spline_columns(covariate, knots(covariate[layout.rows], count))
+        if columns.shape[1]:
+            out[name] = columns
+    return out
 
 
 def ridge(m: Array, off: Sequence[int], columns: Sequence[int], target: int = -1) -> Array:

@@ -121,11 +121,10 @@ class Factor:
 
 @dataclass(frozen=True)
 class Layout:
-    """The samples `rows` of a problem, by channel; `drifts`: see `ResidualProblem`."""
+    """The samples `rows` of a problem, by channel."""
 
     rows: Index
     channels: tuple[Channel, ...]
-    drifts: bool = True
 
     @classmethod
     def of(cls, problem: ResidualProblem, rows: Index) -> Layout:
@@ -138,7 +137,7 @@ class Layout:
             starts = np.append(True, np.diff(series) != 0)[: index.size]
             step = np.append(1.0, np.diff(time))[: index.size]
             channels.append(Channel(index, np.where(starts, 1.0, step), starts))
-        return cls(rows, tuple(channels), problem.drifts)
+        return cls(rows, tuple(channels))
 
 
 def gram(layout: Layout, noise: Noise, columns: Array) -> Array:
@@ -241,11 +240,14 @@ def _fit_channel(channel: Channel, x: Array, y: Array, start: Colour | None) -> 
 
 
 def deviance(layout: Layout, noise: Noise, x: Array, y: Array) -> float:
-    """−2·l summed over the channels, of y (rows,) about the columns x (rows, p): the smaller, the likelier."""
+    """−2·l summed over the channels, of y (rows,) about the columns x (rows, p): the smaller, the likelier. A channel of which
+    the columns leave next to nothing says nothing; ∞ where rounding is all that is left of one."""
     total = 0.0
     for channel, colour in zip(layout.channels, noise, strict=True):
         if channel.index.size:
             part, target = _clear(channel, x, y)
+            if target.size - part.shape[1] < FEWEST or not target.any():
+                continue
             try:
                 total += criterion(channel, colour.kappa, colour.tau, part, target)[0]
             except (FloatingPointError, np.linalg.LinAlgError):

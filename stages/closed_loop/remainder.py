@@ -3,7 +3,6 @@
 Functions
 ---------
 learned_step   adds the curve that explains what is left, if groups held out agree
-splines_of     the columns of every covariate
 """
 
 from __future__ import annotations
@@ -21,10 +20,9 @@ from stages.closed_loop.result import Step, Value
 from stages.closed_loop.score_test import search
 from stages.closed_loop.settings import LoopSettings
 from stages.closed_loop.state import CERTAIN, State
-from stages.closed_loop.wording import held_out_text, noise_text, p_text, repeats, why_not
+from stages.closed_loop.wording import held_out_text, noise_text, p_text, why_not
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 LEARNED_TRIES = 6  # covariates looked at, the most significant first
 
@@ -35,7 +33,7 @@ def learned_step(
     """Add the spline of a covariate that explains what is left, if held-out error falls; False where none does. One that stands
     out and does not help leaves the next its turn."""
     done = {s.effect.removeprefix("learned:") for s in state.steps if s.table is not None}
-    splines = splines_of(problem, layout, settings.spline_columns)
+    splines = learned.splines_of(problem, layout, settings.spline_columns)
     splines = {name: s for name, s in splines.items() if name not in done}
     if np.unique(problem.group[layout.rows]).size < 2:
         return False
@@ -45,18 +43,6 @@ def learned_step(
             return answer
         del splines[answer]
     return False
-
-
-def splines_of(problem: ResidualProblem, layout: Layout, count: int = 7) -> dict[str, Array]:
-    out = {}
-    for name, covariate in problem.covariates.items():
-        if isinstance(covariate, Basis):
-            columns = covariate.columns
-        else:
-            columns = learned.spline_columns(covariate, learned.knots(covariate[layout.rows], count))
-        if columns.shape[1]:
-            out[name] = columns
-    return out
 
 
 def _try_learned(
@@ -71,7 +57,7 @@ def _try_learned(
     rows, columns, data = layout.rows, state.columns, state.residual
     p = columns.shape[1]
     names = list(splines)
-    drifts = [k for k, n in enumerate(names) if _is_time(problem, n)]
+    of_time = [k for k, n in enumerate(names) if problem.drifts and _is_time(problem, n)]
     finding, state.noise = search(
         layout,
         columns[rows],
@@ -80,8 +66,8 @@ def _try_learned(
         state.noise,
         settings.draws,
         rng,
-        None,
-        drifts,
+        of_time=of_time,
+        drifts=problem.drifts,
     )
     if finding is None or finding.p > settings.learned_p_value:
         return False
@@ -92,12 +78,17 @@ def _try_learned(
         problem, layout, finding.noise, columns[rows], spline[rows], data[rows], settings.controls, rng
     )
     both = np.column_stack([columns, spline])
-    model = Model(data, both, smooth=own, added=own)
+    model = Model(data, both, smooth=own if _is_smooth(problem, name) else (), added=own)
     m = gram(layout, finding.noise, np.column_stack([both, data])[rows])
     beta = confirmation.coefficients(m, both.shape[1], model)
     term = spline @ beta[list(own)]
     library = [
-        Model(data, np.column_stack([columns, s]), smooth=tuple(range(p, p + s.shape[1]))) for s in splines.values()
+        Model(
+            data,
+            np.column_stack([columns, s]),
+            smooth=tuple(range(p, p + s.shape[1])) if _is_smooth(problem, one) else (),
+        )
+        for one, s in splines.items()
     ]
     checked = confirmation.confirm(
         problem, rows, Model(data, columns), library, names, names, finding.index, model, finding.noise, settings.snr
@@ -125,12 +116,18 @@ def _try_learned(
             )
         )
         state.nuisance = np.column_stack([state.nuisance, spline])
-        state.noise = finding.noise
+        # Beside a curve of time the noise is another one, and to be looked for anew.
+        state.noise = None if finding.index in of_time else finding.noise
         return True
     state.notes.append(f"{name} stands out among covariates (p {p_text(finding.p)}) but is not used: {problem_text}")
-    if finding.p < CERTAIN and repeats(checked) and confirmation.controls_fail(reached, valid):
+    if finding.p < CERTAIN and checked.repeats and confirmation.controls_fail(reached, valid):
         state.certain.append(f"learned:{name}")
     return name
+
+
+def _is_smooth(problem: ResidualProblem, covariate: str) -> bool:
+    values = problem.covariates[covariate]
+    return values.smooth if isinstance(values, Basis) else True
 
 
 def _is_time(problem: ResidualProblem, covariate: str) -> bool:

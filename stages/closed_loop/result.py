@@ -98,7 +98,8 @@ class Sealed:
 @dataclass(frozen=True)
 class LoopResult:
     """Verdict of one stage with its steps, limits, notes; `values` are the effects that its model lacked; `considered` the
-    library as it was first looked at; `pictures` the residual for a figure."""
+    library as it was first looked at; `pictures` the residual for a figure; `unexplained`: whether something is left for which
+    nothing that was added accounts, whatever the verdict."""
 
     stage: str
     verdict: Verdict
@@ -112,6 +113,7 @@ class LoopResult:
     notes: tuple[str, ...]
     considered: tuple[Considered, ...]
     pictures: Pictures
+    unexplained: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Verdict, steps, limits and notes as plain data, with the keys of loop.json."""
@@ -134,6 +136,7 @@ def taken_back(result: LoopResult, why: Mapping[str, str], considered: Sequence[
     return replace(
         result,
         verdict=result.verdict if result.steps or not why else "unexplained",
+        unexplained=result.unexplained or bool(why),
         notes=(*result.notes, *(f"{name} {text}" for name, text in outcome.items())),
         considered=tuple(replace(one, outcome=outcome.get(name, one.outcome)) for name, one in known.items()),
     )

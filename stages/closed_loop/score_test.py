@@ -51,7 +51,8 @@ NOWHERE_NEAR = 0.3  # family-wise p at both first looks, beyond which there is n
 
 @dataclass(frozen=True)
 class Finding:
-    """The best member: index, p family-wise, log of its effect's p, χ² and rank, and the noise with it in the model."""
+    """The best member: index, p family-wise, log of its effect's p, χ² and rank, and the noise with it in the model (of a curve
+    of time: without it)."""
 
     index: int
     p: float
@@ -117,11 +118,12 @@ def search(
     draws: int,
     rng: np.random.Generator,
     log_tests: Array | None = None,
-    drifts: Collection[int] = (),
+    of_time: Collection[int] = (),
+    drifts: bool = True,
 ) -> tuple[Finding | None, Noise]:
     """The most significant of `signatures` [(rows, q), …] in `residual` (rows,) beside `nuisance` (rows, p), and the noise
     without any of them; no finding where no signature is left beside the nuisance. `log_tests`: of `log_counts` (default: 0);
-    `drifts`: those that are curves of time."""
+    `of_time`: those that are curves of time; `drifts`: see `ResidualProblem`."""
     log_tests = np.zeros(len(signatures)) if log_tests is None else log_tests
     everything = np.column_stack([nuisance, *signatures, residual])
     p = nuisance.shape[1]
@@ -150,8 +152,8 @@ def search(
     best: Finding | None = None
     for k in dict.fromkeys(order):
         with_k = np.column_stack([nuisance, signatures[k]])
-        known = nuisance if k in drifts else with_k
-        noise = null if k in drifts else fit_noise(layout, known, residual)
+        known = nuisance if k in of_time else with_k
+        noise = null if k in of_time else fit_noise(layout, known, residual)
         narrow = np.column_stack([with_k, residual])
         own = list(range(p, p + signatures[k].shape[1]))
         logs = []
@@ -159,7 +161,7 @@ def search(
             value, rank = statistic(project(gram(layout, one, narrow), slice(0, p)), own)
             logs.append(log_tail(value, rank) if rank else 0.0)
         log_p_k = float(logsumexp(logs) - np.log(len(logs)))
-        if layout.drifts:
+        if drifts:
             ratio, rank = likelihood_ratio(layout, nuisance, signatures[k], residual, null, noise)
             log_p_k = max(log_p_k, log_tail(ratio, rank) if rank else 0.0)
         log_p_k += float(log_tests[k])
@@ -192,7 +194,8 @@ def likelihood_ratio(
         noise = fit_noise(layout, nuisance, left, noise)
         lowest = min(lowest, deviance(layout, noise, nuisance, left))
     without = min(deviance(layout, n, nuisance, residual) for n in (null, fit_noise(layout, nuisance, residual, noise)))
-    return max(without - lowest, 0.0), rank
+    ratio = without - lowest
+    return (max(ratio, 0.0), rank) if np.isfinite(ratio) else (0.0, rank)
 
 
 def log_counts(effects: Sequence[str], kinds: Sequence[str]) -> Array:

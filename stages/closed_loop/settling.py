@@ -25,7 +25,6 @@ from stages.closed_loop.signatures import Member, derivatives
 from stages.closed_loop.state import UNNEEDED, State
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 TOLD = 2.0  # sigma, from zero
 

@@ -1,4 +1,11 @@
-"""Where the loop stands."""
+"""Where the loop stands.
+
+Classes and functions
+---------------------
+State    what was added, refused, told so far
+left     what the model's columns leave
+rms      its size
+"""
 
 from __future__ import annotations
 
@@ -13,7 +20,6 @@ from stages.closed_loop.result import Step
 from stages.closed_loop.signatures import Values
 
 Array = NDArray[np.float64]
-Index = NDArray[np.intp]
 
 CERTAIN = 1e-3  # family-wise p of structure that is there, though nothing accounts for it
 UNNEEDED = 0.05  # p of an effect beside others, or of sensors that differ in what they were taken to share

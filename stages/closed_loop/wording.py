@@ -1,22 +1,18 @@
-"""What the loop says of its evidence."""
+"""What the loop says of its evidence.
+
+Functions
+---------
+why_not, held_out_text    of groups held out
+p_text, noise_text        of a test, and of the noise that it was made in
+controls_text             of shifted copies
+"""
 
 from __future__ import annotations
-
-import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.residual_problem import ResidualProblem
 from stages.closed_loop import confirmation
 from stages.closed_loop.confirmation import Confirmation
 from stages.closed_loop.noise import Noise
-
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
-
-
-def repeats(checked: Confirmation) -> bool:
-    """Whether what one part of the data shows helps another part at all: else it is no structure of the instrument."""
-    return checked.gain > 0.0 and checked.log_likelihood > 0.0
 
 
 def why_not(checked: Confirmation) -> str:

@@ -41,7 +41,7 @@ ENTRIES = ((0, 0), (1, 1), (2, 2), *((i, j) for i in range(3) for j in range(3) 
 def covariates_of(
     solution: Solution, imu: Imu, chosen: Index, count: int, bases: Mapping[str, Basis]
 ) -> dict[str, Array | Basis]:
-    """Of the vehicle at each chosen fix (k,), for each of `count` components; velocity and acceleration are each component's own.
+    """Of the vehicle at each chosen fix (k,), for each of `count` components; acceleration is each component's own.
 
     imu: with its thermometers; bases: those that the filter carries on (`bases_of`).
     """
@@ -73,7 +73,8 @@ def covariates_of(
 
 
 def inputs_of(active: Index, store: kalman.Store) -> Inputs:
-    """The errors whose traces are the columns of `bases_of`."""
+    """The errors whose traces are the columns of `bases_of`. Velocities behind by a latency show the unit's acceleration alone:
+    what vibration does to the antenna beyond it depends on the phase."""
     sizes = [3, 2, *(len(ENTRIES) for _ in SENSORS)]
     made = Inputs.none(active.size, sum(sizes), store.rows.size, np.array([4]))
     arm, late = (states.GROUPS[g] for g in ("antenna_lever_arm", "gnss_latency"))
@@ -81,8 +82,7 @@ def inputs_of(active: Index, store: kalman.Store) -> Inputs:
     at = int(np.searchsorted(active, late.start))
     made.start[at, 3] = 1.0
     speed = np.linalg.norm(store.H[:, :3, at], axis=1)
-    made.direct[:, :, 0] = store.H[:, :, at] * (speed / REFERENCE_SPEED)[:, None]
-    made.direct[store.rows < 3] = 0.0
+    made.direct[:, :, 0] = store.H[:, :, at] * (speed / REFERENCE_SPEED)[:, None]  # zero but at a fix
     column = 5
     for first, source in SENSORS.values():
         for i, j in ENTRIES:
@@ -93,8 +93,8 @@ def inputs_of(active: Index, store: kalman.Store) -> Inputs:
 
 def bases_of(columns: Array, speed: Array, rate: Array, force: Array) -> dict[str, Basis]:
     """columns (n, 32): what the errors of `inputs_of` show in the samples; norms (n,): speed, rate, force (SI)."""
-    heading = np.linspace(-180.0, 180.0, TABLE)
-    c, s, zero = np.cos(np.radians(heading)), np.sin(np.radians(heading)), np.zeros(TABLE)
+    heading = np.linspace(-np.pi, np.pi, TABLE)
+    c, s, zero = np.cos(heading), np.sin(heading), np.zeros(TABLE)
     fixed = {
         "north": np.column_stack([c, -s, zero]),
         "east": np.column_stack([s, c, zero]),
@@ -104,8 +104,10 @@ def bases_of(columns: Array, speed: Array, rate: Array, force: Array) -> dict[st
     late = {"behind": np.column_stack([v, v**2 / REFERENCE_SPEED])}
     nowhere = np.full(speed.size, np.nan)
     out = {
-        ATTITUDE: Basis(columns[:, :3], nowhere, heading, fixed, "deg", dict.fromkeys(fixed, "m"), common=True),
-        VELOCITY: Basis(columns[:, 3:5], speed, v, late, "m/s", {"behind": "m"}, common=True),
+        ATTITUDE: Basis(
+            columns[:, :3], nowhere, heading, fixed, "rad", dict.fromkeys(fixed, "m"), common=True, smooth=False
+        ),
+        VELOCITY: Basis(columns[:, 3:5], speed, v, late, "m/s", {"behind": "m"}, common=True, smooth=False),
     }
     first = 5
     for (name, (kind, _)), values in zip(SENSORS.items(), (rate, force, force), strict=True):
@@ -119,7 +121,14 @@ def bases_of(columns: Array, speed: Array, rate: Array, force: Array) -> dict[st
         }
         unit = "m/s²" if kind else "rad/s"
         out[name] = Basis(
-            own, values, at, entries, "rad/s" if name == GYROS else "m/s²", dict.fromkeys(entries, unit), common=True
+            own,
+            values,
+            at,
+            entries,
+            "rad/s" if name == GYROS else "m/s²",
+            dict.fromkeys(entries, unit),
+            common=True,
+            smooth=False,
         )
     return out
 

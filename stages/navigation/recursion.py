@@ -13,7 +13,7 @@ Inputs       the errors: e at the start, what they feed, what they show
 Functions
 ---------
 carried      `shown` of every measurement
-signals      one, mean rate and mean specific force of every epoch
+signals      mean rate and mean specific force of every epoch
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 NONE = -1
-ONE, RATE, FORCE = 0, np.arange(1, 4), np.arange(4, 7)  # columns of `signals`
+RATE, FORCE = np.arange(3), np.arange(3, 6)  # columns of `signals`
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """start (n, q); sensor (q,): which of the six biases' places a column feeds, gyros first, or NONE; source (q,): the signal it
-    is multiplied by; direct (m, 6, k): what columns `shows` (k,) add to every measurement by themselves."""
+    """start (n, q), in the states' units; sensor (q,): which of the six biases' places a column feeds, gyros first, or NONE;
+    source (q,): the signal it is multiplied by; direct (m, 6, k) [m, m/s]: what columns `shows` (k,) add to every measurement by
+    themselves."""
 
     start: Array
     sensor: Index
@@ -58,12 +59,12 @@ class Inputs:
 
 
 def signals(imu: Imu, store: kalman.Store, count: int) -> Array:
-    """(count − 1, 7): one, then means of rate [rad/s] and specific force [m/s²] between the ends of epochs, in body axes."""
+    """(count − 1, 6): means of rate [rad/s] and specific force [m/s²] between the ends of epochs, in body axes."""
     summed = cumulative_trapezoid(np.hstack([imu.gyro, imu.accel]), imu.time, axis=0, initial=0.0)
     ends = store.epoch_time[:count]
     between = np.diff(np.stack([np.interp(ends, imu.time, s) for s in summed.T], -1), axis=0)
     span = np.maximum(np.diff(ends), 1e-9)
-    return np.column_stack([np.ones(count - 1), between / span[:, None]])
+    return np.asarray(between / span[:, None])
 
 
 def carried(store: kalman.Store, count: int, active: Index, inputs: Inputs, signal: Array) -> Array:

@@ -64,7 +64,11 @@ TOLD, LAG_ROUNDS = 6.0, 4  # sigma of a lag of the velocities that is beyond dou
 VELOCITIES = 3  # components of a fix, before those of its velocity
 VELOCITY_LAG, LARGEST_LAG = "velocity_lag_s", 1.0  # s: more is no filter's
 BEYOND_DOUBT = 1e-3  # p of biases that are left free
-MINUTE, SHORTEST, GROUPS = 60.0, 8.0, 16  # s, s: what is held out is a minute, or a sixteenth of a shorter flight
+MINUTE, SHORTEST, GROUPS = (
+    60.0,
+    8.0,
+    16,
+)  # s, s: what is held out is a minute, or a sixteenth of a flight, but no less than 8 s
 FEWEST_FIXES = 20
 KEPT = 8  # linearisations in memory
 EXACT = 1e-6  # relative, of a step
@@ -272,7 +276,8 @@ def residual_problem(
         solution = _widely_estimated(imu, moved, model, mounting, settings, initial, correction, effects)
         theta = declared(mounting, effects)
         innovations = _innovations(solution, model, settings, theta)
-        first = innovations.at(np.zeros(len(innovations.order)))
+        none = np.zeros(len(innovations.order))
+        first = innovations.kept[none.tobytes()] = innovations.at(none)
         near = innovations.at(_apart(solution, innovations.order, theta))
         count = first.residual.size // innovations.chosen.size
         if count == VELOCITIES:

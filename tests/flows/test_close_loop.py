@@ -178,12 +178,13 @@ def test_wrong_input_ends_in_one_line(laboratory: Path, tmp_path: Path, tsmftis:
 
 def test_what_geometry_adds_to_an_unexplained_path_is_doubted() -> None:
     added = {"steps": [{"effect": "boresight"}], "notes": ["one"]}
-    for verdict, doubted in (("unexplained", True), ("no_effect", False)):
-        told = close._doubted(Part("geometry"), added, {"navigation": {"verdict": verdict}})
+    for doubted in (True, False):
+        told = close._doubted(Part("geometry"), added, {"navigation": {"unexplained": doubted}})
         assert told["notes"] == ["one"] + [close.DOUBTFUL_PATH] * doubted
+    assert close._doubted(Part("geometry"), added, {}) == added
     nothing = {"steps": [], "notes": []}
-    assert close._doubted(Part("geometry"), nothing, {"navigation": {"verdict": "unexplained"}}) == nothing
-    assert close._doubted(Part("spectral"), added, {"navigation": {"verdict": "unexplained"}}) == added
+    assert close._doubted(Part("geometry"), nothing, {"navigation": {"unexplained": True}}) == nothing
+    assert close._doubted(Part("spectral"), added, {"navigation": {"unexplained": True}}) == added
 
 
 def test_a_flight_that_cannot_serve_leaves_the_others_their_turn(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,7 @@ def test_problems_of_one_instrument_are_joined_under_one_set_of_parameters() -> 
 def test_bases_are_joined_where_a_coefficient_means_the_same_everywhere() -> None:
     def with_bases(n: int, count: int) -> ResidualProblem:
         columns = np.arange(n * 2.0).reshape(n, 2)
-        at, curves = np.arange(1.0 * n), {"b": np.ones((n, 2))}
+        at, curves = np.arange(1.0 * n), {"b": np.full((n, 2), 1.0 * n)}
         named = {
             "common": Basis(columns, np.ones(n), at, curves, common=True),
             "own": Basis(columns, np.ones(n), at, curves),
@@ -57,7 +57,8 @@ def test_bases_are_joined_where_a_coefficient_means_the_same_everywhere() -> Non
     both = joined(parts)
     assert list(both.covariates) == ["common"]
     basis = both.covariates["common"]
-    assert isinstance(basis, Basis) and basis.at.size == 10
+    assert isinstance(basis, Basis) and basis.at.size == 10 and basis.curves["b"].tolist() == [[10.0, 10.0]] * 10
+    assert basis.values.size == 16
     np.testing.assert_array_equal(
         basis.columns,
         np.vstack([p.covariates["common"].columns for p in parts.values()]),  # type: ignore[union-attr]

@@ -10,7 +10,7 @@ import closed_loop as made_up
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
 from pipeline.errors import InputError
 from pipeline.formats.opus import read_opus
@@ -22,7 +22,7 @@ from stages.closed_loop import LoopSettings, refit, run, taken_back
 from stages.closed_loop.confirmation import controls, controls_fail
 from stages.closed_loop.learned import knots, spline_columns
 from stages.closed_loop.noise import Colour, Layout, basis, criterion, fit_noise, gram, log_det
-from stages.closed_loop.score_test import family_wise, likelihood_ratio, log_counts, log_tail
+from stages.closed_loop.score_test import family_wise, likelihood_ratio, log_counts, log_tail, project, statistic
 from stages.closed_loop.signatures import tied, untied
 
 SHARED = Path(os.environ.get("TSMFTIS_SHARED", Path(__file__).parents[2].parent / "shared")) / "data" / "opus"
@@ -89,7 +89,7 @@ def test_restricted_likelihood_is_that_of_dense_matrices(kappa: float, tau: floa
 
 
 def test_the_likelihood_ratio_is_that_of_dense_matrices() -> None:
-    """Both maxima by scipy's own search over κ, τ, σ² and β; Λ exceeds no χ² of known noise where there is none."""
+    """Both maxima by scipy's own search over κ, τ, σ² and β."""
     problem, x, y = uneven(2)
     layout, slow = Layout.of(problem, np.arange(120)), np.sin(0.05 * problem.time)[:, None]
     y = y + 0.8 * slow[:, 0]
@@ -120,8 +120,38 @@ def test_a_random_walk_is_no_curve_of_time() -> None:
         y = rng.standard_normal(360) + 0.1 * np.cumsum(rng.standard_normal(360))
         layout = {"time": time, "series": np.zeros(360, int), "group": np.arange(360) // 15 % 8}
         problem = simple(y, {"a": rng.standard_normal(360)}, covariates={"time": time}, **layout)
-        learnt += bool(run(problem, QUICK, seed).steps)
+        learnt += any(step.effect == "learned:time" for step in run(problem, QUICK, seed).steps)
     assert learnt < 4
+
+
+def test_slow_signatures_in_a_random_walk_do_not_fool_the_ratio() -> None:
+    """Three slow cosines beside eight slower ones: at a p of 1 %, 8 or more of 200 come with a chance of 1e-3. By their χ² in the
+    noise that is left beside them 10 do."""
+    time, by_chi2, by_ratio = np.arange(200.0), 0, 0
+    waves = np.cos(np.pi * np.arange(11) * time[:, None] / 200.0)
+    for seed in range(200):
+        rng = np.random.default_rng([8, seed])
+        y = rng.standard_normal(200) + 0.16 * np.cumsum(rng.standard_normal(200))
+        problem = simple(y, {"a": waves[:, 8]}, runs=1, time=time, series=np.zeros(200, int))
+        layout, (slower, slow) = Layout.of(problem, np.arange(200)), np.split(waves, [8], axis=1)
+        null, beside = fit_noise(layout, slower, y), fit_noise(layout, waves, y)
+        m = project(gram(layout, beside, np.column_stack([waves, y])), slice(0, 8))
+        by_chi2 += bool(chi2.sf(statistic(m, range(8, 11))[0], 3) < 0.01)
+        by_ratio += bool(chi2.sf(likelihood_ratio(layout, slower, slow, y, null, beside)[0], 3) < 0.01)
+    assert by_ratio < 8 <= by_chi2
+
+
+def test_a_channel_of_which_nothing_is_left_makes_the_ratio_no_nan() -> None:
+    rng = np.random.default_rng(7)
+    channel = np.repeat([0, 1], [57, 3])
+    x = np.zeros((60, 3))
+    x[57:] = np.eye(3)
+    y, slow = rng.standard_normal(60), np.sin(0.1 * np.arange(60.0))[:, None] * (channel == 0)[:, None]
+    problem = simple(y, {"a": slow[:, 0]}, time=np.arange(60.0), series=channel, group=channel, channel=channel)
+    layout = Layout.of(problem, np.arange(60))
+    null, beside = fit_noise(layout, x, y), fit_noise(layout, np.column_stack([x, slow]), y)
+    ratio, rank = likelihood_ratio(layout, x, slow, y, null, beside)
+    assert np.isfinite(ratio) and rank == 1
 
 
 def test_fitted_noise_is_the_maximum_of_the_dense_likelihood() -> None:
