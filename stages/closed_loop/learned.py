@@ -77,6 +77,8 @@ def spline_columns(covariate: Array, at: Array) -> Array:
 
 
 def splines_of(problem: ResidualProblem, layout: Layout, count: int) -> dict[str, Array]:
+    """Columns (n, k) of every covariate that varies, by its name: a basis' own, or splines on `count` + 1 quantiles of `layout`'s
+    samples."""
     out = {}
     for name, covariate in problem.covariates.items():
         if isinstance(covariate, Basis):

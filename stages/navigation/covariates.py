@@ -16,6 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.curves import TABLE
 from pipeline.records import Imu
 from pipeline.residual_problem import Basis
 from stages.navigation import kalman, states
@@ -28,7 +29,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 AXES = "xyz"
-TABLE = 25
 REFERENCE_SPEED = 10.0  # m/s, at which the two lags of `velocity` are the same
 ATTITUDE, VELOCITY = "attitude", "velocity"
 GYROS, ACCELEROMETERS, G_SENSITIVITY = "angular rate", "specific force", "specific force on the gyros"
